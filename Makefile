@@ -1,0 +1,71 @@
+# make lab: everything from nothing to open notebooks.   make test: the same set-up, then all tests.
+
+VENV := .venv
+STAMP := $(VENV)/.complete
+PY := $(VENV)/bin/python
+SCALE ?= reduced
+NOTEBOOKS ?= $(wildcard notebooks/*.ipynb)
+LAB_ARGS ?=
+PYTEST_ARGS ?=
+
+# A robotics shell often sets PYTHONPATH, and its packages would shadow the locked ones.
+unexport PYTHONPATH
+unexport PYTHONHOME
+# The kernel of this environment wins over one in the home folder.
+export JUPYTER_PREFER_ENV_PATH := 1
+
+.PHONY: help venv lab test notebooks lint bench lock clean
+
+help:
+	@echo "make lab         create $(VENV) from environment.lock and open the notebooks in JupyterLab"
+	@echo "make test        create the same, run the unit tests and every notebook at scale smoke"
+	@echo "make venv        only create $(VENV)"
+	@echo "make notebooks   execute and save all notebooks   (SCALE=smoke|reduced|full, NOTEBOOKS=...)"
+	@echo "make lint        check style with ruff"
+	@echo "make bench       run the benchmarks"
+	@echo "make lock        write environment.lock anew from pyproject.toml (needs uv)"
+	@echo "make clean       remove $(VENV) and caches"
+	@echo "PYTHON=/path/to/python3.12 chooses the interpreter (3.11, 3.12 or 3.13)"
+
+venv: $(STAMP)
+
+$(STAMP): environment.lock pyproject.toml
+	@PYTHON="$(PYTHON)" sh .ci/make_venv.sh $(VENV)
+	@touch $@
+
+lab: $(STAMP)
+	$(PY) -m jupyterlab --ServerApp.root_dir=. --LabApp.default_url=/lab/tree/notebooks \
+		$$(test "$$(id -u)" = 0 && echo --allow-root) $(LAB_ARGS)
+
+# Both parts run even if the first one fails.
+test: $(STAMP)
+	@status=0; \
+	$(PY) -m pytest tests $(PYTEST_ARGS) || status=$$?; \
+	if [ -n "$(NOTEBOOKS)" ]; then \
+		SHAPEBODY_SCALE=smoke $(PY) -m pytest --nbmake --nbmake-timeout=900 $(NOTEBOOKS) \
+			|| status=$$?; \
+	fi; \
+	exit $$status
+
+notebooks: $(STAMP)
+	SHAPEBODY_SCALE=$(SCALE) $(PY) -m shapebody.notebooks $(NOTEBOOKS)
+
+lint: $(STAMP)
+	$(PY) -m ruff check .
+	$(PY) -m ruff format --check .
+
+bench: $(STAMP)
+	@set -e; for file in benchmarks/*.py; do \
+		if [ -e "$$file" ]; then echo "== $$file"; $(PY) "$$file"; fi; \
+	done
+
+lock:
+	@sed -n '/^#/p' environment.lock > environment.lock.tmp
+	@uv pip compile --quiet --universal --python-version 3.11 --generate-hashes --extra dev \
+		--no-header --no-annotate --no-emit-index-url --output-file environment.lock pyproject.toml
+	@cat environment.lock >> environment.lock.tmp
+	@mv environment.lock.tmp environment.lock
+
+clean:
+	rm -rf $(VENV) build dist .pytest_cache .ruff_cache .hypothesis
+	find . -name __pycache__ -type d -prune -exec rm -rf {} +
