@@ -55,9 +55,14 @@ def foot_name(name: str) -> str:
     return name if "foot" in name else f"{name}_foot"
 
 
-def look_material(body: dict, shape: dict, posture: set[str]) -> str:
+def look_material(sheet: dict, body: dict, shape: dict, posture: set[str]) -> str:
     if body["parent"] is None:
         return "trunk"
+    for foot in sheet["feet"]:
+        reach = max(shape["size"]) if shape["type"] != "capsule" else sum(shape["size"])
+        distance = np.linalg.norm(np.subtract(foot["pos"], shape["pos"]))
+        if foot["body"] == body["name"] and distance < reach < 4 * max(foot["size"]):
+            return "foot"  # a shoe: it may hide the foot geom
     if shape["type"] == "cylinder":
         return "motor"
     return "posture" if body["name"] in posture else "link"
@@ -78,15 +83,11 @@ def build(sheet: dict) -> str:
     add_looks(root)
     world = ET.SubElement(root, "worldbody")
     ET.SubElement(
-        world, "light", name="key", directional="true", pos="0 0 4", dir="-0.4 0.5 -1",
-        diffuse="0.6 0.6 0.6", specular="0.2 0.2 0.2",
-    )  # fmt: skip
-    ET.SubElement(
         world, "light", name="fill", directional="true", pos="0 0 4", dir="0.6 -0.3 -0.6",
         diffuse="0.25 0.25 0.28", castshadow="false",
     )  # fmt: skip
     ET.SubElement(world, "geom", {"name": "floor", "class": "floor"})
-    feet, spheres, camera = add_bodies(world, sheet)
+    feet, spheres, trunk = add_bodies(world, sheet)
     contact = ET.SubElement(root, "contact")
     for foot in feet:
         ET.SubElement(contact, "pair", geom1="floor", geom2=foot, condim="3", friction=FRICTION)
@@ -104,19 +105,23 @@ def build(sheet: dict) -> str:
     middle = np.append(np.round((low + high)[:2] / 2, 2), round(float(qpos[2]) * 0.6, 2))
     statistic.set("center", numbers(middle))
     statistic.set("extent", number(round(extent, 2)))
-    camera.set("pos", numbers(np.round(1.35 * extent * np.array([0.74, -0.95, 0.36]), 2)))
+    view = 1.35 * extent * np.array([0.74, -0.95, 0.36])
+    trunk.find("camera").set("pos", numbers(np.round(view, 2)))
+    # Shadows are sharp near a light's axis only, so the light follows the trunk.
+    trunk.find("light").set("pos", numbers(np.round(1.5 * extent * np.array([0.4, -0.5, 1]), 2)))
     ET.indent(root, "  ")
     return ET.tostring(root, encoding="unicode").replace(" />", "/>") + "\n"
 
 
 def add_looks(root: ET.Element) -> None:
     visual = ET.SubElement(root, "visual")
-    ET.SubElement(
-        visual, "global", offwidth="1280", offheight="960", azimuth="130", elevation="-18"
-    )
-    ET.SubElement(
-        visual, "headlight", ambient="0.3 0.3 0.3", diffuse="0.3 0.3 0.3", specular="0 0 0"
-    )
+    for name, attributes in {
+        "global": {"offwidth": "1280", "offheight": "960", "azimuth": "130", "elevation": "-18"},
+        "headlight": {"ambient": "0.3 0.3 0.3", "diffuse": "0.3 0.3 0.3", "specular": "0 0 0"},
+        "quality": {"shadowsize": "4096"},
+        "rgba": {"haze": "0.86 0.90 0.95 1"},
+    }.items():
+        ET.SubElement(visual, name, attributes)
     asset = ET.SubElement(root, "asset")
     ET.SubElement(
         asset, "texture", name="sky", type="skybox", builtin="gradient",
@@ -144,12 +149,11 @@ def add_looks(root: ET.Element) -> None:
 
 
 def add_bodies(world: ET.Element, sheet: dict) -> tuple[list[str], list[str], ET.Element]:
-    """Add the tree; returns names of feet and spheres in MuJoCo order, and the camera."""
+    """Add the tree; returns names of feet and spheres in MuJoCo order, and the trunk."""
     feet: list[str] = []
     spheres: list[str] = []
     kept = set(sheet["keep_nominal"])
     posture = {joint["body"] for joint in sheet["joints"] if joint["name"] in kept}
-    cameras = []
 
     def add(parent: ET.Element, body: dict) -> None:
         name = body["name"]
@@ -167,7 +171,7 @@ def add_bodies(world: ET.Element, sheet: dict) -> tuple[list[str], list[str], ET
                 add_joint(element, joint)
         for shape in body["shapes"]:
             geom = {"class": "look", "type": shape["type"], "size": numbers(shape["size"])}
-            material = look_material(body, shape, posture)
+            material = look_material(sheet, body, shape, posture)
             geom |= frame(shape["pos"], shape["quat"])
             if material != "link":
                 geom["material"] = material
@@ -185,21 +189,20 @@ def add_bodies(world: ET.Element, sheet: dict) -> tuple[list[str], list[str], ET
                 ET.SubElement(element, "geom", geom | frame(sphere["pos"], [1, 0, 0, 0]))
         if body["parent"] is None:
             ET.SubElement(element, "site", name="imu", pos=numbers(sheet["imu_pos"]), size="0.01")
-            cameras.append(
-                ET.SubElement(
-                    element,
-                    "camera",
-                    name="track",
-                    mode="trackcom",
-                    xyaxes="0.79 0.61 0 -0.17 0.22 0.96",
-                )  # fmt: skip
-            )
+            ET.SubElement(
+                element, "camera", name="track", mode="trackcom",
+                xyaxes="0.79 0.61 0 -0.17 0.22 0.96",
+            )  # fmt: skip
+            ET.SubElement(
+                element, "light", name="key", mode="trackcom", directional="true",
+                dir="-0.4 0.5 -1", diffuse="0.6 0.6 0.6", specular="0.2 0.2 0.2",
+            )  # fmt: skip
         for child in sheet["bodies"]:
             if child["parent"] == name:
                 add(element, child)
 
     add(world, next(body for body in sheet["bodies"] if body["parent"] is None))
-    return feet, spheres, cameras[0]
+    return feet, spheres, world.find("body")
 
 
 def add_joint(body: ET.Element, joint: dict) -> None:
