@@ -1,0 +1,607 @@
+"""Trained agents on disk, and exact copies of training state. No pickle; every write is atomic.
+
+An agent is a folder:
+
+    weights.safetensors   policy and critic, float32, keys such as "policy/params/core/layer_0/bias"
+    agent.json            network configurations, robots, padding, metadata, hashes
+    states.npz            the state bank (absent if the agent has none)
+    curve.csv             the learning curve (absent if it was not recorded)
+
+`agent.json` holds SHA-256 hashes of weights and states, so that a file that was cut off, edited or
+left over from another agent is noticed.
+"""
+
+from __future__ import annotations
+
+import csv
+import dataclasses
+import difflib
+import functools
+import hashlib
+import importlib.metadata
+import io
+import json
+import os
+import platform
+import secrets
+import subprocess
+import zipfile
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import safetensors
+import safetensors.numpy
+
+from .descriptions import Descriptions, Sizes
+from .locomotion.observations import Observation
+from .networks import (
+    FOOT_OBSERVATION,
+    GENERAL,
+    JOINT_OBSERVATION,
+    PRIVILEGED,
+    Critic,
+    CriticConfig,
+    Policy,
+    PolicyConfig,
+    initialize,
+)
+from .paths import data_dir
+
+FORMAT = 1
+WEIGHTS, DESCRIPTION, STATES, CURVE = "weights.safetensors", "agent.json", "states.npz", "curve.csv"
+_PACKAGES = ("shapebody", "jax", "flax", "optax", "mujoco", "numpy")
+
+
+@dataclass(frozen=True, eq=False)
+class Agent:
+    """A frozen policy and critic with what a design search needs beside them.
+
+    Attributes:
+        name: name of the folder in `data/checkpoints`.
+        robots: names of the robots it was trained on.
+        sizes: numbers of joints, feet and spheres to which everything is padded.
+        policy_config, critic_config: sizes of the networks.
+        policy, critic: variables of the networks, {"params": ..., "constants": ...}.
+        states: the state bank of M states, an Observation with leading axis M, padded to `sizes`,
+            float32; None if there is none.
+        state_robots: int[M], index into `robots` of the robot that each state comes from.
+        metadata: JSON-like facts about the training: configuration, scale, steps, seconds,
+            versions, commit, machine.
+    """
+
+    name: str
+    robots: tuple[str, ...]
+    sizes: Sizes
+    policy_config: PolicyConfig
+    critic_config: CriticConfig
+    policy: Any
+    critic: Any
+    states: Observation | None = None
+    state_robots: np.ndarray | None = None
+    metadata: dict = field(default_factory=dict)
+
+    @functools.cached_property
+    def policy_module(self) -> Policy:
+        return Policy(self.policy_config)
+
+    @functools.cached_property
+    def critic_module(self) -> Critic:
+        return Critic(self.critic_config)
+
+    def act(self, descriptions: Descriptions, observation: Observation):
+        """Action means [..., J], in units of the action scale."""
+        return _mean_action(self.policy_config)(self.policy, descriptions, observation)
+
+    def values(self, descriptions: Descriptions, observation: Observation):
+        """Values [..., K] of the critic's heads."""
+        return _values(self.critic_config)(self.critic, descriptions, observation)
+
+    @functools.cached_property
+    def hash(self) -> str:
+        """SHA-256 of the weights of policy and critic, hexadecimal."""
+        return _hash(_flat_weights(self))
+
+    @property
+    def num_states(self) -> int:
+        """Size M of the state bank."""
+        return 0 if self.states is None else len(self.states.general)
+
+    def __repr__(self) -> str:
+        return (
+            f"Agent({self.name!r}, robots={list(self.robots)}, {self.num_states} states, "
+            f"hash={self.hash[:12]})"
+        )
+
+
+@functools.lru_cache
+def _mean_action(config: PolicyConfig):
+    module = Policy(config)
+    return jax.jit(lambda variables, d, o: module.apply(variables, d, o)[0])
+
+
+@functools.lru_cache
+def _values(config: CriticConfig):
+    return jax.jit(Critic(config).apply)
+
+
+# ---------------------------------------------------------------------- files
+
+
+def atomic_write(path: str | Path, data: bytes | str) -> Path:
+    """Write a file so that it is never seen half-written; its folder is created if needed."""
+    path = Path(path)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    if isinstance(data, str):
+        data = data.encode()
+    temporary = path.with_name(f".{path.name}.{secrets.token_hex(4)}.tmp")
+    try:
+        with open(temporary, "xb") as file:
+            file.write(data)
+            file.flush()
+            os.fsync(file.fileno())
+        os.replace(temporary, path)
+    finally:
+        temporary.unlink(missing_ok=True)
+    return path
+
+
+def provenance() -> dict:
+    """Versions, commit and machine of this process, for results and agents.
+
+    `commit` is that of the checkout which holds the package, with "+" if tracked files differ from
+    it; None outside a git checkout or without git.
+    """
+    versions = {"python": platform.python_version()}
+    for package in _PACKAGES:
+        try:
+            versions[package] = importlib.metadata.version(package)
+        except importlib.metadata.PackageNotFoundError:
+            versions[package] = "not installed"
+    device = jax.devices()[0]
+    return {
+        "versions": versions,
+        "commit": _commit(),
+        "machine": {
+            "system": platform.system(),
+            "processor": platform.machine(),
+            "cpus": os.cpu_count(),
+            "device": device.device_kind if device.platform != "cpu" else "cpu",
+        },
+    }
+
+
+def _commit() -> str | None:
+    folder = Path(__file__).resolve().parent
+
+    def git(*arguments):
+        command = ["git", "-C", str(folder), *arguments]
+        return subprocess.run(
+            command, capture_output=True, text=True, check=True, timeout=10
+        ).stdout
+
+    try:
+        # An installed package may lie inside somebody else's repository.
+        if Path(git("rev-parse", "--show-toplevel").strip()) != folder.parent:
+            return None
+        changed = git("status", "--porcelain", "--untracked-files=no", "--", str(folder)).strip()
+        return git("rev-parse", "HEAD").strip() + ("+" if changed else "")
+    except (OSError, subprocess.SubprocessError):
+        return None
+
+
+# ---------------------------------------------------------------------- agents
+
+
+def agents() -> list[str]:
+    """Names of the agents in `data/checkpoints`, sorted."""
+    return sorted(
+        path.parent.name for path in (data_dir() / "checkpoints").glob(f"*/{DESCRIPTION}")
+    )
+
+
+def save_agent(
+    agent: Agent,
+    folder: str | Path | None = None,
+    curve: Sequence[Mapping[str, Any]] | None = None,
+) -> Path:
+    """Write an agent and return its folder.
+
+    Args:
+        agent: the agent; versions, commit and machine are added to its metadata where missing.
+        folder: where to write; `data/checkpoints/<name>` if not given.
+        curve: rows of the learning curve, written to curve.csv; if not given, an existing
+            curve.csv is left as it is.
+
+    Raises:
+        ValueError: if shapes do not fit the configurations, or metadata cannot be written as JSON.
+    """
+    check_agent(agent)
+    folder = data_dir() / "checkpoints" / agent.name if folder is None else Path(folder)
+    weights = _flat_weights(agent)
+    states = _flat_states(agent)
+    document = {
+        "format": FORMAT,
+        "name": agent.name,
+        "robots": list(agent.robots),
+        "sizes": dataclasses.asdict(agent.sizes),
+        "policy_config": dataclasses.asdict(agent.policy_config),
+        "critic_config": dataclasses.asdict(agent.critic_config),
+        "hash": _hash(weights),
+        "states_hash": None if states is None else _hash(states),
+        "metadata": {**provenance(), **agent.metadata},
+    }
+    try:
+        text = json.dumps(document, indent=1, default=_plain, allow_nan=False) + "\n"
+    except (TypeError, ValueError) as error:
+        raise ValueError(
+            f"metadata of agent {agent.name!r} cannot be written as JSON ({error}); use numbers, "
+            "strings, lists and dictionaries, and None instead of NaN"
+        ) from error
+    # The description comes last: an interruption before it leaves a mismatch that loading reports.
+    atomic_write(folder / WEIGHTS, safetensors.numpy.save(weights))
+    if states is None:
+        (folder / STATES).unlink(missing_ok=True)
+    else:
+        buffer = io.BytesIO()
+        np.savez_compressed(buffer, **states)
+        atomic_write(folder / STATES, buffer.getvalue())
+    if curve is not None:
+        atomic_write(folder / CURVE, _csv(curve))
+    atomic_write(folder / DESCRIPTION, text)
+    return folder
+
+
+def load_agent(name_or_folder: str | Path) -> Agent:
+    """Load an agent by name from `data/checkpoints`, or from a folder.
+
+    A Path, or a string with a path separator in it, is a folder; any other string is a name.
+
+    Raises:
+        ValueError: for an unknown name (the known ones are listed); for files that are cut off,
+            edited, of another version or do not fit together.
+        FileNotFoundError: for a missing folder or file.
+    """
+    folder = _find(name_or_folder)
+    document = _read_description(folder)
+    restore = f"restore the folder, for example with 'git checkout -- {folder}', or train anew"
+    try:
+        sizes = Sizes(**document["sizes"])
+        policy_config = PolicyConfig(**document["policy_config"])
+        critic_config = CriticConfig(**document["critic_config"])
+        name, robots = document["name"], tuple(document["robots"])
+        weights_hash, states_hash = document["hash"], document["states_hash"]
+        metadata = document["metadata"]
+    except (KeyError, TypeError, ValueError) as error:
+        raise ValueError(
+            f"{folder / DESCRIPTION} is not a valid agent description "
+            f"({type(error).__name__}: {error}); {restore}"
+        ) from error
+
+    weights = _read_safetensors(folder / WEIGHTS, restore)
+    variables = {}
+    for role, module in (("policy", Policy(policy_config)), ("critic", Critic(critic_config))):
+        own = {k.removeprefix(f"{role}/"): v for k, v in weights.items() if k.startswith(role)}
+        _check_shapes(own, _expected(module), f"{folder / WEIGHTS} ({role})", restore)
+        variables[role] = _nest(own)
+    if _hash(weights) != weights_hash:
+        raise ValueError(
+            f"{folder / WEIGHTS} does not match the hash in {DESCRIPTION}: it was edited or "
+            f"belongs to another agent; {restore}"
+        )
+    states, state_robots = None, None
+    if states_hash is not None:
+        states, state_robots = _read_states(folder / STATES, states_hash, restore)
+    agent = Agent(
+        name=name,
+        robots=robots,
+        sizes=sizes,
+        policy_config=policy_config,
+        critic_config=critic_config,
+        policy=variables["policy"],
+        critic=variables["critic"],
+        states=states,
+        state_robots=state_robots,
+        metadata=metadata,
+    )
+    check_agent(agent)
+    return agent
+
+
+def load_curve(name_or_folder: str | Path) -> dict[str, np.ndarray]:
+    """Columns of an agent's learning curve; numbers as float64, NaN where a cell is empty.
+
+    Raises FileNotFoundError if the agent has none.
+    """
+    path = _find(name_or_folder) / CURVE
+    if not path.is_file():
+        raise FileNotFoundError(f"{path} does not exist: this agent has no learning curve")
+    with open(path, newline="", encoding="utf-8") as file:
+        rows = list(csv.DictReader(file))
+    columns = {}
+    for name in rows[0] if rows else ():
+        cells = [row[name] for row in rows]
+        try:
+            columns[name] = np.array([float(cell) if cell else np.nan for cell in cells])
+        except ValueError:
+            columns[name] = np.array(cells)
+    return columns
+
+
+def check_agent(agent: Agent) -> None:
+    """Raise ValueError if the parts of an agent do not fit together."""
+    if not agent.robots:
+        raise ValueError(f"agent {agent.name!r} names no robots; give at least one")
+    for role, module, variables in (
+        ("policy", agent.policy_module, agent.policy),
+        ("critic", agent.critic_module, agent.critic),
+    ):
+        flat = _flatten(variables)
+        fix = f"initialize the {role} with its own configuration"
+        _check_shapes(flat, _expected(module), f"{role} of agent {agent.name!r}", fix)
+    if agent.states is None:
+        return
+    count = agent.num_states
+    expected = {
+        "joints": (count, agent.sizes.joints, JOINT_OBSERVATION),
+        "feet": (count, agent.sizes.feet, FOOT_OBSERVATION),
+        "general": (count, GENERAL),
+        "privileged": (count, PRIVILEGED),
+    }
+    for name, shape in expected.items():
+        found = np.shape(getattr(agent.states, name))
+        if found != shape or count == 0:
+            raise ValueError(
+                f"states.{name} of agent {agent.name!r} has shape {found}, expected {shape} with "
+                "at least one state; pad observations to the agent's sizes"
+            )
+    owners = agent.state_robots
+    if (
+        np.shape(owners) != (count,)
+        or np.min(owners) < 0
+        or np.max(owners) >= len(agent.robots)
+        or not np.issubdtype(np.asarray(owners).dtype, np.integer)
+    ):
+        raise ValueError(
+            f"state_robots of agent {agent.name!r} must be {count} integers from 0 to "
+            f"{len(agent.robots) - 1}, one per state: the index of its robot in agent.robots"
+        )
+
+
+def _find(name_or_folder: str | Path) -> Path:
+    text = str(name_or_folder)
+    if isinstance(name_or_folder, Path) or os.sep in text or "/" in text:
+        folder = Path(name_or_folder).expanduser()
+        if not folder.is_dir():
+            raise FileNotFoundError(
+                f"agent folder {text!r} does not exist (looked at {folder.absolute()}): give an "
+                "existing folder, or one of the names of shapebody.checkpoints.agents()"
+            )
+        return folder
+    known = agents()
+    if text not in known:
+        close = difflib.get_close_matches(text, known, n=1)
+        hint = f"; did you mean {close[0]!r}?" if close else "."
+        listing = ", ".join(known) if known else "none"
+        raise ValueError(
+            f"there is no agent {text!r} in {data_dir() / 'checkpoints'}{hint} "
+            f"Available agents: {listing}"
+        )
+    return data_dir() / "checkpoints" / text
+
+
+def _read_description(folder: Path) -> dict:
+    path = folder / DESCRIPTION
+    if not path.is_file():
+        raise FileNotFoundError(
+            f"{path} does not exist: {folder} is no agent, or its files were copied incompletely"
+        )
+    try:
+        document = json.loads(path.read_text(encoding="utf-8"))
+        number = document["format"]
+    except (ValueError, KeyError, TypeError) as error:
+        raise ValueError(
+            f"{path} is not a valid agent description ({type(error).__name__}: {error}); restore "
+            "the file or train anew"
+        ) from error
+    if number != FORMAT:
+        raise ValueError(
+            f"{path} has format {number!r}, expected {FORMAT}; use the version of shapebody that "
+            "wrote it, or train anew"
+        )
+    return document
+
+
+def _read_safetensors(path: Path, fix: str) -> dict[str, np.ndarray]:
+    if not path.is_file():
+        raise FileNotFoundError(f"{path} does not exist; {fix}")
+    try:
+        return safetensors.numpy.load(path.read_bytes())
+    except (safetensors.SafetensorError, KeyError, ValueError) as error:
+        raise ValueError(f"{path} is cut off or no safetensors file ({error}); {fix}") from error
+
+
+def _read_states(path: Path, expected_hash: str, fix: str):
+    if not path.is_file():
+        raise FileNotFoundError(f"{path} does not exist; {fix}")
+    try:
+        with np.load(path, allow_pickle=False) as file:
+            arrays = {name: file[name] for name in file.files}
+        owners = arrays["state_robots"]
+        states = Observation(**{k: v for k, v in arrays.items() if k != "state_robots"})
+    except (OSError, KeyError, TypeError, ValueError, EOFError, zipfile.BadZipFile) as error:
+        raise ValueError(f"{path} is cut off or no state bank ({error}); {fix}") from error
+    if _hash(arrays) != expected_hash:
+        raise ValueError(
+            f"{path} does not match the hash in {DESCRIPTION}: it was edited or belongs to another "
+            f"agent; {fix}"
+        )
+    return states, owners
+
+
+def _flatten(tree, prefix="") -> dict[str, Any]:
+    flat = {}
+    for key, value in tree.items():
+        name = f"{prefix}{key}"
+        flat.update(_flatten(value, name + "/") if isinstance(value, Mapping) else {name: value})
+    return flat
+
+
+def _nest(flat: Mapping[str, Any]) -> dict:
+    tree: dict = {}
+    for name, value in flat.items():
+        *path, last = name.split("/")
+        node = tree
+        for key in path:
+            node = node.setdefault(key, {})
+        node[last] = value
+    return tree
+
+
+def _flat_weights(agent: Agent) -> dict[str, np.ndarray]:
+    flat = _flatten({"policy": agent.policy, "critic": agent.critic})
+    return {name: np.array(flat[name], np.float32, order="C") for name in sorted(flat)}
+
+
+def _flat_states(agent: Agent) -> dict[str, np.ndarray] | None:
+    if agent.states is None:
+        return None
+    names = [f.name for f in dataclasses.fields(Observation)]
+    flat = {name: np.array(getattr(agent.states, name), np.float32, order="C") for name in names}
+    return flat | {"state_robots": np.array(agent.state_robots, np.int32)}
+
+
+@functools.lru_cache
+def _expected(module) -> dict[str, tuple[int, ...]]:
+    """Shapes of freshly initialized variables, by flat name."""
+    variables = jax.eval_shape(lambda: initialize(module, jax.random.key(0)))
+    return {name: leaf.shape for name, leaf in _flatten(variables).items()}
+
+
+def _check_shapes(flat: Mapping[str, Any], expected: Mapping[str, tuple], what: str, fix: str):
+    problems = [f"{name} is missing" for name in expected if name not in flat]
+    problems += [f"{name} is unknown" for name in flat if name not in expected]
+    problems += [
+        f"{name} has shape {np.shape(flat[name])}, expected {shape}"
+        for name, shape in expected.items()
+        if name in flat and np.shape(flat[name]) != shape
+    ]
+    if problems:
+        more = f" and {len(problems) - 3} more" if len(problems) > 3 else ""
+        raise ValueError(
+            f"{what} does not fit its configuration: {'; '.join(problems[:3])}{more}; {fix}"
+        )
+
+
+def _hash(arrays: Mapping[str, np.ndarray]) -> str:
+    """SHA-256 of named arrays, independent of their order and of the file format."""
+    digest = hashlib.sha256()
+    for name in sorted(arrays):
+        array = np.asarray(arrays[name])
+        array = array.astype(array.dtype.newbyteorder("<"), order="C", copy=False)
+        digest.update(f"{name} {array.dtype.str} {array.shape}\n".encode())
+        digest.update(array.tobytes())
+    return digest.hexdigest()
+
+
+def _csv(rows: Sequence[Mapping[str, Any]]) -> str:
+    columns = list(dict.fromkeys(name for row in rows for name in row))
+    file = io.StringIO(newline="")
+    writer = csv.DictWriter(file, columns, lineterminator="\n")
+    writer.writeheader()
+    for row in rows:
+        writer.writerow({k: _plain(v) if hasattr(v, "shape") else v for k, v in row.items()})
+    return file.getvalue()
+
+
+def _plain(value):
+    """JSON form of what the standard encoder does not know."""
+    if dataclasses.is_dataclass(value) and not isinstance(value, type):
+        return dataclasses.asdict(value)
+    if hasattr(value, "tolist"):
+        return np.asarray(value).tolist()
+    if isinstance(value, Path):
+        return str(value)
+    raise TypeError(f"{type(value).__name__} is not JSON")
+
+
+# ---------------------------------------------------------------------- exact training state
+
+
+def save_arrays(path: str | Path, pytree) -> Path:
+    """Write any pytree of arrays and numbers to one safetensors file, exactly.
+
+    Leaves may be NumPy or JAX arrays (float, int, uint or bool) and Python numbers; None is part
+    of the structure. New-style PRNG keys must be given as `jax.random.key_data(key)`.
+
+    Raises:
+        ValueError: for a leaf of another type.
+    """
+    return atomic_write(path, safetensors.numpy.save(dict(_leaves(pytree))))
+
+
+def load_arrays(path: str | Path, like):
+    """Read a file of `save_arrays` into the structure of `like`.
+
+    Leaves come back as what `like` holds: NumPy arrays, JAX arrays or Python numbers (NumPy arrays
+    for `jax.ShapeDtypeStruct`), with the same bits as they were saved with.
+
+    Raises:
+        FileNotFoundError: for a missing file.
+        ValueError: if the file is cut off, or its names, shapes or types differ from those of
+            `like`.
+    """
+    path = Path(path)
+    fix = "delete it to start anew, or use the configuration it was written with"
+    stored = _read_safetensors(path, fix)
+    expected = dict(_leaves(like, shapes_only=True))
+    problems = [f"{name} is missing" for name in expected if name not in stored]
+    problems += [f"{name} is unknown" for name in stored if name not in expected]
+    for name, (shape, dtype) in expected.items():
+        if name in stored and (stored[name].shape, stored[name].dtype) != (shape, dtype):
+            problems.append(
+                f"{name} is {stored[name].dtype}{list(stored[name].shape)}, expected "
+                f"{dtype}{list(shape)}"
+            )
+    if problems:
+        more = f" and {len(problems) - 3} more" if len(problems) > 3 else ""
+        raise ValueError(
+            f"{path} does not fit the state to be restored: {'; '.join(problems[:3])}{more}; {fix}"
+        )
+
+    def restored(place, leaf):
+        value = stored[_leaf_name(place)]
+        if isinstance(leaf, jax.Array):
+            return jnp.array(value)
+        if isinstance(leaf, bool | int | float):
+            return value.item()
+        return value
+
+    return jax.tree_util.tree_map_with_path(restored, like)
+
+
+def _leaf_name(place) -> str:
+    return jax.tree_util.keystr(place, simple=True, separator="/") or "value"
+
+
+def _leaves(pytree, shapes_only=False):
+    """Names and arrays, or names and (shape, dtype), of the leaves of a pytree."""
+    for place, leaf in jax.tree_util.tree_leaves_with_path(pytree):
+        name = _leaf_name(place)
+        if shapes_only and hasattr(leaf, "dtype") and hasattr(leaf, "shape"):
+            yield name, (tuple(leaf.shape), np.dtype(leaf.dtype))
+            continue
+        # Copies: the leaf may be a live buffer or not contiguous.
+        array = None
+        if not (hasattr(leaf, "dtype") and jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key)):
+            array = np.array(leaf, order="C")
+        if array is None or array.dtype.kind not in "fiub":
+            raise ValueError(
+                f"leaf {name!r} is {getattr(leaf, 'dtype', type(leaf).__name__)}; expected an "
+                "array of float, int, uint or bool (for PRNG keys use jax.random.key_data)"
+            )
+        yield name, (array.shape, array.dtype) if shapes_only else array
