@@ -72,10 +72,14 @@ def prepare(
             "diagonal at compile time; designs that move its centre of mass would be simulated "
             "wrongly. Give the body a jointed child in the MJCF file"
         )
-    # The world's flags stay: it never moves, and engines skip it.
-    model.body_sameframe[1:] = mujoco.mjtSameFrame.mjSAMEFRAME_NONE
-    model.geom_sameframe[:] = mujoco.mjtSameFrame.mjSAMEFRAME_NONE
-    model.site_sameframe[:] = mujoco.mjtSameFrame.mjSAMEFRAME_NONE
+    same = mujoco.mjtSameFrame
+    # The world's flag stays: it never moves, and engines skip it.
+    model.body_sameframe[1:] = same.mjSAMEFRAME_NONE
+    # Designs move geoms and sites but do not turn them within their body, so where the
+    # orientation is the body's own, that part of the mark stays true and saves time.
+    for flags in (model.geom_sameframe, model.site_sameframe):
+        with_body = (flags == same.mjSAMEFRAME_BODY) | (flags == same.mjSAMEFRAME_BODYROT)
+        flags[:] = np.where(with_body, same.mjSAMEFRAME_BODYROT, same.mjSAMEFRAME_NONE)
     model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
     if solver_iterations is not None:
         model.opt.iterations = _at_least_one("solver_iterations", solver_iterations)

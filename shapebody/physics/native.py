@@ -156,15 +156,21 @@ class NativePhysics:
             self._write("qpos", self.qpos, qpos)
         if qvel is not None:
             self._write("qvel", self.qvel, qvel)
-        return self._run(self._batch.step, nstep=self.substeps)
-
-    def forward(self) -> Readings:
-        """Compute the sensors of the present states, without advancing them.
-
-        For the first observation of an episode; the control is that of the last `step`, or the
-        nominal positions after `set_state`.
-        """
-        return self._run(self._batch.forward)
+        self._warnings[...] = 0
+        finite = self._valid()
+        with _silent_log():
+            try:
+                self._batch.step(nstep=self.substeps)
+            except SimulationError as error:
+                finite[error.ids] = False
+        sensordata = self._sensordata
+        finite &= self._valid() & ~self._warnings.any(1) & np.isfinite(sensordata).all(1)
+        if not finite.all():
+            failed = np.flatnonzero(~finite)
+            self.set_state(failed, self.robot.home, np.zeros(self.model.nv))
+            sensordata = sensordata.copy()
+            sensordata[failed] = self._home_sensordata
+        return Readings(self.qpos, self.qvel, sensordata, finite)
 
     def state(self) -> dict[str, np.ndarray]:
         """Copies of all arrays from which `restore` resumes exactly.
@@ -194,24 +200,10 @@ class NativePhysics:
         for name, array in arrays.items():
             self._batch.bind(name)[...] = array
 
-    def _run(self, advance, **options) -> Readings:
-        self._warnings[...] = 0
-        # Comparing instead of isfinite also catches what MuJoCo calls a huge value.
-        finite = (np.abs(self.qpos) <= MAX_VALUE).all(1) & (np.abs(self.qvel) <= MAX_VALUE).all(1)
-        sensordata = self._sensordata
-        with _silent_log():
-            try:
-                advance(**options)
-            except SimulationError as error:
-                finite[error.ids] = False
-        finite &= (np.abs(self.qpos) <= MAX_VALUE).all(1) & (np.abs(self.qvel) <= MAX_VALUE).all(1)
-        finite &= ~self._warnings.any(1) & np.isfinite(sensordata).all(1)
-        if not finite.all():
-            failed = np.flatnonzero(~finite)
-            self.set_state(failed, self.robot.home, np.zeros(self.model.nv))
-            sensordata = sensordata.copy()
-            sensordata[failed] = self._home_sensordata
-        return Readings(self.qpos, self.qvel, sensordata, finite)
+    def _valid(self) -> np.ndarray:
+        # A comparison instead of isfinite: it also catches what MuJoCo calls a huge value.
+        state = (self.qpos, self.qvel)
+        return np.logical_and(*((np.abs(x) <= MAX_VALUE).all(1) for x in state))
 
     def _ids(self, ids: np.ndarray) -> np.ndarray:
         ids = np.asarray(ids)
