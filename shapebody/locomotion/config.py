@@ -1,0 +1,90 @@
+"""Settings of the locomotion task: one frozen dataclass, every default from Appendix A."""
+
+from dataclasses import dataclass
+from math import pi
+
+CONTROL_STEP = 0.02
+"""Seconds per control step (50 Hz); physics runs four substeps of 5 ms inside it."""
+
+GAIT_PERIOD = 0.5
+"""Seconds per cycle of the gait clock that the policy observes."""
+
+
+@dataclass(frozen=True)
+class TaskConfig:
+    """The velocity-tracking task (Appendix A).
+
+    Everything random about an episode except the design itself is scaled by the
+    curriculum coefficient c in [0, 1]: at c = 0 the robot starts in its nominal pose
+    and feels no noise, no delay and no pushes.
+    """
+
+    horizon: int = 1000
+    """Control steps per episode (20 s)."""
+
+    command_limit: float | None = None
+    """Largest commanded velocity in m/s (rad/s for yaw); None: min(1, 2 x mean robot dimension)."""
+    command_change: float = 0.002
+    """Probability per control step that a new command is drawn."""
+    command_dead_zone: float = 0.1
+    """Components below this share of the limit become zero."""
+    command_all_zero: float = 0.04
+    """Probability that a new command asks the robot to stand."""
+    command_single_zero: float = 0.005
+    """Probability that one component of a new command becomes zero."""
+
+    noise_joint_position: float = 0.01
+    """Half-width of the uniform noise on joint positions, rad."""
+    noise_joint_velocity: float = 1.5
+    """... on joint velocities, rad/s."""
+    noise_angular_velocity: float = 0.2
+    """... on the IMU's angular velocity, rad/s."""
+    noise_gravity: float = 0.05
+    """... on the projected gravity direction."""
+
+    action_delay: int | None = None
+    """Control steps between action and effect: 0, 1, or None for a random delay per episode."""
+    mixed_delay: float = 0.05
+    """With a random delay: probability that it is drawn anew in every control step."""
+
+    initial_yaw: float = pi
+    """Half-width of the initial yaw, rad."""
+    initial_tilt: float = 0.05 * pi
+    """Half-width of the initial roll and pitch, rad."""
+    initial_joint_factor: float = 0.5
+    """Initial joint positions are nominal x (1 +- this) ..."""
+    initial_joint_offset: float = 0.01
+    """... +- this, rad, inside the soft limits."""
+
+    push_probability: float = 0.002
+    """Probability per control step that the trunk is pushed."""
+    push_per_mass: float = 0.1
+    """Largest push in m/s (and rad/s) per kilogram of robot ..."""
+    push_limit: float = 1.0
+    """... and at most this."""
+    push_add: float = 0.5
+    """Probability that a push adds to the trunk velocity; otherwise it replaces it."""
+
+    termination_height: float = 0.8
+    """An episode ends below (1 - c) x this x the nominal IMU height."""
+
+    curriculum_levels: int = 100
+    """A streak of n successful episodes raises c by n over this number."""
+    curriculum_error: float = 0.4
+    """Success needs a mean velocity error per axis of at most this share of the command limit ..."""
+    curriculum_length: int = 500
+    """... and at least this many control steps."""
+
+    def __post_init__(self):
+        if self.action_delay not in (None, 0, 1):
+            raise ValueError(
+                f"action_delay is {self.action_delay!r}; expected 0, 1 or None (random per episode)"
+            )
+        if self.horizon < 1:
+            raise ValueError(f"horizon is {self.horizon}; expected at least one control step")
+
+    @classmethod
+    def evaluation(cls, **changes) -> "TaskConfig":
+        """The settings that reproduce the paper's printed returns: commands within +-1 for
+        every design and an action delay of exactly one control step."""
+        return cls(**{"command_limit": 1.0, "action_delay": 1, **changes})

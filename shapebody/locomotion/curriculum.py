@@ -1,0 +1,29 @@
+"""The performance-based curriculum coefficient c (Appendix A, "Curriculum and design sampling").
+
+Each environment has its own c. A streak of successful episodes raises it faster and
+faster, a streak of failures lowers it likewise, by streak / `curriculum_levels`.
+"""
+
+import jax.numpy as jnp
+
+from shapebody.locomotion.config import TaskConfig
+
+
+def is_success(config: TaskConfig, mean_error, length, command_limit):
+    """Whether an episode counts as a success.
+
+    mean_error: mean over time and axes of |v_xy - c_xy|, m/s; length: control steps;
+    command_limit: m/s.
+    """
+    accurate = mean_error <= config.curriculum_error * command_limit
+    return accurate & (length >= config.curriculum_length)
+
+
+def update(config: TaskConfig, coefficient, streak, success):
+    """New (coefficient in [0, 1], streak) after an episode. `streak` counts successes in a
+    row as positive and failures in a row as negative numbers."""
+    streak = jnp.where(
+        success, jnp.where(streak >= 0, streak + 1, 1), jnp.where(streak < 0, streak - 1, -1)
+    )
+    change = streak.astype(jnp.float32) / config.curriculum_levels
+    return jnp.clip(coefficient + change, 0.0, 1.0), streak

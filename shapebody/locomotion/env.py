@@ -1,0 +1,496 @@
+"""The locomotion environment: episodes of `episode.py` on one of two physics engines.
+
+With the native engine a Python loop alternates jitted task code with one threaded call of
+C MuJoCo; with MJX the whole rollout is one jitted scan. Environments of several robots
+share one batch: joints, feet and spheres are padded to the largest robot and masked.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from shapebody.descriptions import Descriptions, Sizes, describe, kinematics
+from shapebody.design import DesignSpace
+from shapebody.locomotion import episode as episodes
+from shapebody.locomotion import randomization
+from shapebody.locomotion.config import TaskConfig
+from shapebody.locomotion.episode import Episode, Outcome
+from shapebody.locomotion.observations import Observation
+from shapebody.locomotion.readings import Readings, reader
+from shapebody.robots import Robot
+
+RESET_SLOTS = 16
+"""Finished environments are restarted in chunks of this size, so that one compiled
+function serves any number of them."""
+
+Policy = Callable[[Any, jax.Array, Descriptions, Observation], tuple[jax.Array, Any]]
+"""(params, key, descriptions[N], observation[N]) -> (action[N, J], extra pytree[N])."""
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class Trajectory:
+    """T control steps of N environments.
+
+    A design is fixed for an episode, so a rollout holds few of them. `descriptions` keeps
+    two per environment, the one at the start of the rollout and the one at its end, and
+    `slot` says which applies in each step. Steps of an episode that began and ended within
+    the rollout have neither; `valid` is 0 there.
+    """
+
+    observation: Observation  # [T, N, ...]
+    action: jax.Array  # [T, N, J]
+    extra: Any  # [T, N, ...] what the policy returned beside the action
+    reward: jax.Array  # [T, N]
+    terminated: jax.Array  # [T, N] bool
+    truncated: jax.Array  # [T, N] bool
+    finite: jax.Array  # [T, N] bool
+    slot: jax.Array  # [T, N] int32, 0 or 1
+    valid: jax.Array  # [T, N] float32
+    descriptions: Descriptions  # [2, N, ...]
+    last_observation: Observation  # [N, ...] after the last step
+    episode_return: jax.Array  # [T, N] return so far, episode_length likewise
+    episode_length: jax.Array
+    episode_error: jax.Array  # [T, N] mean ||v_xy - c_xy||_2 so far, m/s
+    coefficient: jax.Array  # [T, N] curriculum coefficient
+
+
+class StepRecord(NamedTuple):
+    """What one control step adds to a trajectory."""
+
+    observation: Observation
+    action: jax.Array
+    extra: Any
+    reward: jax.Array
+    terminated: jax.Array
+    truncated: jax.Array
+    finite: jax.Array
+    episode_return: jax.Array
+    episode_length: jax.Array
+    episode_error: jax.Array
+    coefficient: jax.Array
+
+
+class _Group:
+    """The environments of one robot: a slice of the batch with its own physics."""
+
+    def __init__(self, robot: Robot, sizes: Sizes, first: int, count: int, config, design_dim):
+        self.robot, self.first, self.count = robot, first, count
+        self.slice = slice(first, first + count)
+        self.space = DesignSpace(robot)
+        self.read = reader(robot, sizes)
+        self.start = jax.vmap(
+            _starter(robot, self.space, sizes, config, design_dim), in_axes=(0, 0, 0, 0)
+        )
+        self.qvel_index = np.asarray(robot.qvel_index)
+
+
+def _starter(robot: Robot, space: DesignSpace, sizes: Sizes, config: TaskConfig, design_dim: int):
+    """(key, design[d], coefficient, streak) -> (Episode, Embodiment, qpos, qvel)."""
+    to_descriptions, forward = describe(robot, sizes), kinematics(robot)
+    home = jnp.asarray(robot.home, jnp.float32)
+    site_quat = jnp.asarray(robot.model.site_quat[robot.imu_site], jnp.float32)
+    qpos_index = np.asarray(robot.qpos_index)
+
+    def start(key, design, coefficient, streak):
+        embodiment = space(design)
+        d = to_descriptions(embodiment)
+        pose_key, episode_key = jax.random.split(key)
+        quat, joints = randomization.initial_pose(config, pose_key, d, coefficient)
+        qpos = home.at[:2].set(0.0).at[2].set(d.home_height).at[3:7].set(quat)
+        qpos = qpos.at[qpos_index].set(joints[: robot.num_actuators])
+        # Put the centre of the lowest foot at floor height, as at the nominal pose.
+        frames = forward(embodiment, qpos)
+        lift = -jnp.min(frames.geom_pos[np.asarray(robot.feet), 2])
+        qpos = qpos.at[2].add(lift)
+        rise = jnp.array([0.0, 0.0, 1.0]) * lift
+
+        def padded(x, length):
+            return jnp.pad(x, [(0, length - x.shape[0])] + [(0, 0)] * (x.ndim - 1))
+
+        feet, spheres = np.asarray(robot.feet), np.asarray(robot.spheres)
+        readings = Readings(
+            joint_position=joints,
+            joint_velocity=jnp.zeros(sizes.joints),
+            joint_torque=jnp.zeros(sizes.joints),
+            trunk_velocity=jnp.zeros(6),
+            angular_velocity=jnp.zeros(3),
+            linear_velocity=jnp.zeros(3),
+            imu_height=frames.site_pos[robot.imu_site, 2] + lift,
+            imu_quat=_quat_product(quat, site_quat),
+            foot_position=padded(frames.geom_pos[feet] + rise, sizes.feet),
+            foot_down=padded(frames.geom_rot[feet, 2], sizes.feet),
+            foot_velocity=jnp.zeros((sizes.feet, 3)),
+            sphere_position=padded(frames.geom_pos[spheres] + rise, sizes.spheres),
+            finite=jnp.asarray(True),
+        )
+        stored = jnp.pad(design, (0, design_dim - space.dim))
+        state = episodes.start(config, episode_key, stored, d, readings, coefficient, streak)
+        return state, embodiment, qpos, jnp.zeros(robot.model.nv)
+
+    return start
+
+
+class Locomotion:
+    """A batch of environments of one or more robots.
+
+    Args:
+        robots: a Robot or several; environments are shared out evenly, in order.
+        num_envs: size N of the batch.
+        engine: "native" (C MuJoCo), "mjx", or "auto": native on a CPU, MJX otherwise.
+        config: the task's settings.
+        sizes: padding; by default the largest of `robots`.
+        auto_reset: start a new episode, with a new random design, when one ends.
+            Without it a finished environment idles.
+        threads: physics threads of the native engine, 0 for all cores.
+        physics_options: passed on to the engine's constructor.
+
+    Raises:
+        ValueError: for an unknown engine, or fewer environments than robots.
+    """
+
+    def __init__(
+        self,
+        robots: Robot | Sequence[Robot],
+        num_envs: int = 256,
+        engine: str = "auto",
+        config: TaskConfig | None = None,
+        sizes: Sizes | None = None,
+        auto_reset: bool = True,
+        threads: int = 0,
+        physics_options: dict | None = None,
+    ):
+        robots = [robots] if isinstance(robots, Robot) else list(robots)
+        if engine not in ("auto", "native", "mjx"):
+            raise ValueError(f"engine is {engine!r}; expected 'auto', 'native' or 'mjx'")
+        if num_envs < len(robots):
+            raise ValueError(f"num_envs is {num_envs}; {len(robots)} robots need at least as many")
+        if engine == "auto":
+            engine = "native" if jax.default_backend() == "cpu" else "mjx"
+        self.robots, self.num_envs, self.engine = tuple(robots), num_envs, engine
+        self.config = config or TaskConfig()
+        self.sizes = sizes or Sizes.of(*robots)
+        self.auto_reset = auto_reset
+        self.design_dim = max(robot.design_dim for robot in robots)
+        bounds = np.linspace(0, num_envs, len(robots) + 1).astype(int)
+        self.groups = [
+            _Group(robot, self.sizes, first, last - first, self.config, self.design_dim)
+            for robot, first, last in zip(robots, bounds[:-1], bounds[1:], strict=True)
+        ]
+        options = dict(physics_options or {})
+        if engine == "native":
+            from shapebody.physics.native import NativePhysics
+
+            for group in self.groups:
+                group.physics = NativePhysics(group.robot, group.count, threads=threads, **options)
+        else:
+            from shapebody.physics.mjx import MjxPhysics
+
+            for group in self.groups:
+                group.physics = MjxPhysics(group.robot, group.count, **options)
+        self._starts = [jax.jit(group.start) for group in self.groups]
+        self._advance_jit = jax.jit(self._advance)
+        self._scatter = jax.jit(_scatter)
+        self._steps: dict[Any, Callable] = {}
+        self.physics_state = None
+
+    # ------------------------------------------------------------------ task, pure
+
+    def _observe(self, state: Episode):
+        return jax.vmap(partial(episodes.observe, self.config))(state)
+
+    def _control(self, state: Episode, action):
+        return jax.vmap(partial(episodes.control, self.config))(state, action)
+
+    def _advance(self, state: Episode, raw):
+        """raw: per group (qpos, qvel, sensordata, finite)."""
+        parts = [group.read(*out) for group, out in zip(self.groups, raw, strict=True)]
+        readings = jax.tree.map(lambda *x: jnp.concatenate(x), *parts)
+        state, outcome = jax.vmap(partial(episodes.advance, self.config))(state, readings)
+        coefficient, streak = jax.vmap(partial(episodes.next_coefficient, self.config))(state)
+        return state, outcome, (coefficient, streak, _next_key(state.key))
+
+    # ------------------------------------------------------------------ reset
+
+    def reset(
+        self,
+        key: jax.Array,
+        designs=None,
+        coefficient: float = 1.0,
+        spread: bool = False,
+        keys: jax.Array | None = None,
+    ) -> Episode:
+        """Start all environments and return their state.
+
+        Args:
+            key: PRNG key.
+            designs: normalized designs, one [d] or one per environment [N, d] (padded to
+                the largest robot's d); None draws them from U(-c, c).
+            coefficient: curriculum coefficient c in [0, 1] of every environment.
+            spread: cut the first episodes at random horizons, so that episodes do not all
+                end in the same step.
+            keys: one key per environment instead of `key`, to pair episodes across designs.
+        """
+        n = self.num_envs
+        if keys is None:
+            keys = jax.random.split(key, n)
+        coefficients = jnp.full(n, coefficient, jnp.float32)
+        streaks = jnp.zeros(n, jnp.int32)
+        if designs is None:
+            designs = np.asarray(_draw_designs(keys, coefficients, self.design_dim))
+        else:
+            designs = np.asarray(designs, np.float32)
+            designs = np.broadcast_to(designs, (n, designs.shape[-1]))
+        states, physics_states = [], []
+        for group, start in zip(self.groups, self._starts, strict=True):
+            s = group.slice
+            f = jnp.asarray(designs[s, : group.space.dim])
+            state, embodiment, qpos, qvel = start(keys[s], f, coefficients[s], streaks[s])
+            states.append(state)
+            if self.engine == "native":
+                ids = np.arange(group.count)
+                group.physics.set_designs(ids, embodiment)
+                group.physics.set_state(ids, np.asarray(qpos), np.asarray(qvel))
+            else:
+                physics_states.append(group.physics.init(embodiment, qpos, qvel))
+        state = jax.tree.map(lambda *x: jnp.concatenate(x), *states)
+        if spread:
+            horizon = jax.random.randint(
+                jax.random.fold_in(key, 1), (n,), 1, self.config.horizon + 1
+            )
+            state = replace(state, horizon=horizon)
+        self.physics_state = tuple(physics_states)
+        return state
+
+    def _restart(self, state: Episode, done: np.ndarray, following) -> Episode:
+        """Native engine: new episodes for the finished environments."""
+        coefficient, streak, keys = (np.asarray(x) for x in following)
+        for group, start in zip(self.groups, self._starts, strict=True):
+            finished = np.flatnonzero(done[group.slice])
+            for at in range(0, len(finished), RESET_SLOTS):
+                local = finished[at : at + RESET_SLOTS]
+                slots = np.full(RESET_SLOTS, local[0])
+                slots[: len(local)] = local
+                rows = slots + group.first
+                c, k = coefficient[rows], keys[rows]
+                designs = _draw_designs(k, c, group.space.dim)
+                fresh, embodiment, qpos, qvel = start(k, designs, c, streak[rows])
+                m = len(local)
+                group.physics.set_designs(
+                    local, jax.tree.map(lambda x, m=m: np.asarray(x)[:m], embodiment)
+                )
+                group.physics.set_state(local, np.asarray(qpos)[:m], np.asarray(qvel)[:m])
+                # Slots beyond the finished ones repeat the first: the same row, written twice.
+                state = self._scatter(state, rows, fresh)
+        return state
+
+    # ------------------------------------------------------------------ rollouts
+
+    def rollout(
+        self, policy: Policy, params, state: Episode, key: jax.Array, length: int
+    ) -> tuple[Episode, Trajectory]:
+        """Run `policy` for `length` control steps in all environments.
+
+        Args:
+            policy: pure function, see `Policy`. The same object must be passed in every
+                call: one compilation belongs to it.
+            params: its parameters.
+            state: from `reset` or the last rollout.
+            key: PRNG key for the policy's randomness.
+            length: number T of control steps.
+
+        Returns:
+            The new state and the Trajectory.
+        """
+        if self.engine == "mjx":
+            return self._rollout_mjx(policy, params, state, key, length)
+        first = state.descriptions
+        records = []
+        for t in range(length):
+            state, record, _ = self.step(policy, params, state, jax.random.fold_in(key, t))
+            records.append(record)
+        stacked = jax.tree.map(lambda *x: np.stack(x), *records)
+        return state, self._trajectory(stacked, first, state)
+
+    def step(self, policy: Policy, params, state: Episode, key):
+        """One control step with the native engine: (state, StepRecord of numpy arrays, Outcome)."""
+        act = self._compiled(policy)
+        state, observation, action, extra, target, trunk, velocity = act(params, state, key)
+        target, trunk, velocity = np.asarray(target), np.asarray(trunk), np.asarray(velocity)
+        raw = []
+        for group in self.groups:
+            physics, s, nu = group.physics, group.slice, group.robot.num_actuators
+            physics.qvel[:, :6] = trunk[s]
+            physics.qvel[:, group.qvel_index] = velocity[s, :nu]
+            qpos, qvel, sensordata, finite = physics.step(target[s, :nu])
+            raw.append((_f32(qpos), _f32(qvel), _f32(sensordata), np.array(finite)))
+        state, outcome, following = self._advance_jit(state, tuple(raw))
+        record = _record(state, observation, action, extra, outcome)
+        record = jax.tree.map(np.asarray, record)
+        done = record.terminated | record.truncated
+        if self.auto_reset and done.any():
+            state = self._restart(state, done, following)
+        return state, record, outcome
+
+    def _compiled(self, policy: Policy):
+        if policy not in self._steps:
+
+            def act(params, state, key):
+                state, observation = self._observe(state)
+                action, extra = policy(params, key, state.descriptions, observation)
+                state, target, trunk, velocity = self._control(state, action)
+                return state, observation, action, extra, target, trunk, velocity
+
+            self._steps[policy] = jax.jit(act)
+        return self._steps[policy]
+
+    def _trajectory(self, steps: StepRecord, first: Descriptions, state: Episode) -> Trajectory:
+        xp = np if isinstance(steps.reward, np.ndarray) else jnp
+        done = steps.terminated | steps.truncated
+        if not self.auto_reset:
+            done = xp.zeros_like(done)
+        # Episode number of each step within this rollout, and of the state after it.
+        number = xp.cumsum(done, 0) - done
+        final = xp.sum(done, 0)
+        slot = ((number == final) & (final > 0)).astype(np.int32)
+        valid = ((number == 0) | (number == final)).astype(np.float32)
+        _, last_observation = self._observe_jit(state)
+        descriptions = jax.tree.map(lambda a, b: jnp.stack([a, b]), first, state.descriptions)
+        return Trajectory(
+            **steps._asdict(),
+            slot=slot,
+            valid=valid,
+            descriptions=descriptions,
+            last_observation=last_observation,
+        )
+
+    @property
+    def _observe_jit(self):
+        if "observe" not in self._steps:
+            self._steps["observe"] = jax.jit(self._observe)
+        return self._steps["observe"]
+
+    def _rollout_mjx(self, policy, params, state, key, length):
+        name = (policy, length)
+        if name not in self._steps:
+            self._steps[name] = jax.jit(partial(self._scan, policy, length))
+        state, self.physics_state, trajectory = self._steps[name](
+            params, state, self.physics_state, key
+        )
+        return state, trajectory
+
+    def _scan(self, policy, length, params, state, physics, key):
+        first = state.descriptions
+
+        def control_step(carry, key):
+            state, physics = carry
+            state, observation = self._observe(state)
+            action, extra = policy(params, key, state.descriptions, observation)
+            state, target, trunk, velocity = self._control(state, action)
+            stepped, raw = [], []
+            for group, one in zip(self.groups, physics, strict=True):
+                s, nu = group.slice, group.robot.num_actuators
+                qvel = group.physics.velocity(one).at[:, :6].set(trunk[s])
+                qvel = qvel.at[:, group.qvel_index].set(velocity[s, :nu])
+                one = group.physics.with_velocity(one, qvel)
+                one, *out = group.physics.step(one, target[s, :nu])
+                stepped.append(one)
+                raw.append(tuple(out))
+            state, outcome, following = self._advance(state, tuple(raw))
+            record = _record(state, observation, action, extra, outcome)
+            if self.auto_reset:
+                done = outcome.terminated | outcome.truncated
+                state, stepped = self._restart_mjx(state, stepped, done, following)
+            return (state, tuple(stepped)), record
+
+        keys = jax.random.split(key, length)
+        (state, physics), records = jax.lax.scan(control_step, (state, physics), keys)
+        return state, physics, self._trajectory(records, first, state)
+
+    def _restart_mjx(self, state, physics, done, following):
+        coefficient, streak, keys = following
+        fresh, restarted = [], []
+        for group, one in zip(self.groups, physics, strict=True):
+            s = group.slice
+            designs = _draw_designs(keys[s], coefficient[s], group.space.dim)
+            new, embodiment, qpos, qvel = group.start(keys[s], designs, coefficient[s], streak[s])
+            fresh.append(new)
+            restarted.append(group.physics.reset(one, done[s], embodiment, qpos, qvel))
+        fresh = jax.tree.map(lambda *x: jnp.concatenate(x), *fresh)
+
+        def choose(new, old):
+            return jnp.where(done.reshape(done.shape + (1,) * (old.ndim - 1)), new, old)
+
+        return jax.tree.map(choose, fresh, state), restarted
+
+    # ------------------------------------------------------------------ exact resume
+
+    def physics_arrays(self) -> list[dict[str, np.ndarray]]:
+        """The physics state of every robot's environments, for `restore` (native engine)."""
+        return [{k: np.array(v) for k, v in group.physics.state().items()} for group in self.groups]
+
+    def restore(self, state: Episode, arrays: list[dict[str, np.ndarray]]) -> None:
+        """Continue from a saved `state` and its `physics_arrays` (native engine)."""
+        designs = np.asarray(state.design)
+        for group, saved in zip(self.groups, arrays, strict=True):
+            f = designs[group.slice, : group.space.dim]
+            group.physics.set_designs(np.arange(group.count), jax.vmap(group.space)(f))
+            group.physics.restore(saved)
+
+
+def _record(state: Episode, observation, action, extra, outcome: Outcome) -> StepRecord:
+    return StepRecord(
+        observation=observation,
+        action=action,
+        extra=extra,
+        reward=outcome.reward,
+        terminated=outcome.terminated,
+        truncated=outcome.truncated,
+        finite=outcome.finite,
+        episode_return=state.total_reward,
+        episode_length=state.step,
+        episode_error=state.total_distance / jnp.maximum(state.step, 1),
+        coefficient=state.coefficient,
+    )
+
+
+def _f32(x):
+    return np.asarray(x, np.float32)
+
+
+def _scatter(state, rows, fresh):
+    return jax.tree.map(lambda old, new: old.at[rows].set(new), state, fresh)
+
+
+@jax.jit
+def _next_key(keys):
+    """Each environment's key for its next episode, from its key for this one."""
+    return jax.vmap(lambda key: jax.random.fold_in(key, 2**31 - 1))(keys)
+
+
+@partial(jax.jit, static_argnums=2)
+def _draw_designs(keys, coefficients, dim: int):
+    """f ~ U([-c, c]^d), one per key (Section 3.1)."""
+
+    def draw(key, c):
+        return jax.random.uniform(jax.random.fold_in(key, 7), (dim,), minval=-1.0, maxval=1.0) * c
+
+    return jax.vmap(draw)(keys, coefficients)
+
+
+def _quat_product(a, b):
+    aw, ax, ay, az = a
+    bw, bx, by, bz = b
+    return jnp.stack(
+        [
+            aw * bw - ax * bx - ay * by - az * bz,
+            aw * bx + ax * bw + ay * bz - az * by,
+            aw * by - ax * bz + ay * bw + az * bx,
+            aw * bz + ax * by - ay * bx + az * bw,
+        ]
+    )

@@ -1,0 +1,809 @@
+"""Training: PPO over randomized designs (Section 3.1, Appendix A), and policy evaluation.
+
+One iteration collects a rollout of every environment, computes advantages with the current
+critic, and takes several epochs of minibatch steps. A minibatch holds whole environments, so
+that a design is encoded once for all its steps.
+
+On a CPU, an actor thread collects the next rollout while the learner works on the last one.
+The actor's policy is then one update old. The loss accounts for that as decoupled PPO does:
+the trust region is around the policy at the start of the update, and the ratio of that policy
+to the actor's enters as a truncated importance weight.
+
+The second phase, policy evaluation, freezes the policy and trains critics alone on rollouts
+over the full design space.
+"""
+
+import csv
+import os
+import platform
+import sys
+import time
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import asdict, dataclass, field, replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+
+from shapebody.checkpoints import Agent, load_arrays, save_agent, save_arrays
+from shapebody.descriptions import Sizes, describe
+from shapebody.design import DesignSpace
+from shapebody.locomotion import Locomotion, TaskConfig, Trajectory
+from shapebody.networks import (
+    Critic,
+    CriticConfig,
+    Policy,
+    PolicyConfig,
+    entropy,
+    initialize,
+    log_prob,
+    standardization,
+)
+from shapebody.paths import data_dir
+from shapebody.robots import load_robot
+
+
+@dataclass(frozen=True)
+class TrainConfig:
+    """A training run. Defaults are the paper's single-robot run (Appendix A, PPO table)."""
+
+    name: str
+    """Name of the agent and of its folder in data/checkpoints."""
+    robots: tuple[str, ...]
+    """Robots to train on, names or paths; environments are shared out evenly."""
+    scale: str = "full"
+    seed: int = 0
+
+    policy: PolicyConfig = field(default_factory=PolicyConfig)
+    critic: CriticConfig = field(default_factory=CriticConfig)
+    standardize: bool = False
+    """Standardize the network's inputs over the design distribution."""
+
+    num_envs: int = 4096
+    rollout_length: int = 64
+    """Control steps per environment and iteration."""
+    total_steps: int = 1_000_000_000
+    minibatch_size: int = 16_384
+    """Control steps per gradient step: whole environments times the rollout length."""
+    epochs: int = 10
+    learning_rate: tuple[float, float] = (1.5e-3, 3e-4)
+    """At the first and at the last step; linear between."""
+    discount: float = 0.99
+    gae_lambda: float = 0.7
+    clip_range: float = 0.1
+    entropy_coefficient: float = 0.005
+    max_gradient_norm: float = 3.0
+    kl_threshold: float = 0.5
+    """The rest of an iteration's updates is skipped once a minibatch exceeds this."""
+
+    task: TaskConfig = field(default_factory=TaskConfig)
+    learn_policy: bool = True
+    """False in the policy-evaluation phase: only the critic learns, at c = 1."""
+    state_bank: int = 2048
+    """States kept for design search."""
+
+    def __post_init__(self):
+        robots = (self.robots,) if isinstance(self.robots, str) else tuple(self.robots)
+        object.__setattr__(self, "robots", robots)
+        batch = self.num_envs * self.rollout_length
+        if self.minibatch_size % self.rollout_length or batch % self.minibatch_size:
+            raise ValueError(
+                f"minibatch_size is {self.minibatch_size}; it must be a multiple of "
+                f"rollout_length ({self.rollout_length}) and divide num_envs x rollout_length "
+                f"({batch})"
+            )
+
+    @property
+    def batch(self) -> int:
+        """Control steps per iteration."""
+        return self.num_envs * self.rollout_length
+
+    @property
+    def iterations(self) -> int:
+        """Number of iterations of the whole run."""
+        return max(1, self.total_steps // self.batch)
+
+    @classmethod
+    def full(cls, robot: str, **changes) -> "TrainConfig":
+        """The paper's networks and hyperparameters, for a GPU."""
+        return cls(**{"name": f"{robot}_full", "robots": (robot,), **changes})
+
+    @classmethod
+    def reduced(cls, robot: str, **changes) -> "TrainConfig":
+        """Smaller networks and budget, for two CPU cores and some hours."""
+        return cls(
+            **{
+                "name": robot,
+                "robots": (robot,),
+                "scale": "reduced",
+                "policy": PolicyConfig.reduced(),
+                "critic": CriticConfig.reduced(),
+                "standardize": True,
+                "num_envs": 256,
+                "rollout_length": 32,
+                "minibatch_size": 2048,
+                "epochs": 4,
+                "total_steps": 50_000_000,
+                "learning_rate": (1e-3, 3e-4),
+                **changes,
+            }
+        )
+
+    @classmethod
+    def smoke(cls, robot: str, **changes) -> "TrainConfig":
+        """Seconds of training: proves that the code runs and claims nothing."""
+        tiny = {
+            "name": f"{robot}_smoke",
+            "scale": "smoke",
+            "policy": PolicyConfig.reduced(key_widths=(8, 8), core_widths=(16, 8)),
+            "critic": CriticConfig.reduced(
+                joint_key_widths=(8, 8), foot_key_widths=(8, 8), head_widths=(16,)
+            ),
+            "num_envs": 16,
+            "rollout_length": 8,
+            "minibatch_size": 64,
+            "epochs": 2,
+            "total_steps": 512,
+            "state_bank": 64,
+        }
+        return cls.reduced(robot, **{**tiny, **changes})
+
+    @classmethod
+    def at_scale(cls, scale: str, robot: str, **changes) -> "TrainConfig":
+        """`smoke`, `reduced` or `full` by name."""
+        makers = {"smoke": cls.smoke, "reduced": cls.reduced, "full": cls.full}
+        if scale not in makers:
+            raise ValueError(f"scale is {scale!r}; expected one of {', '.join(makers)}")
+        return makers[scale](robot, **changes)
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class Learner:
+    """Everything the learner changes."""
+
+    policy: Any  # variables of Policy.apply
+    critic: Any  # variables of Critic.apply
+    policy_optimizer: Any
+    critic_optimizer: Any
+    iteration: jax.Array  # [] int32, finished iterations
+
+
+# ---------------------------------------------------------------------------- the algorithm
+
+
+def advantages(reward, value, last_value, terminated, truncated, discount, gae_lambda):
+    """Generalized advantage estimation over [N, T] (last_value [N]); returns [N, T].
+
+    A terminated episode is worth nothing afterwards. A truncated one would have gone on: its
+    last state's value stands for that of the next state, one control step later.
+    """
+    done = terminated | truncated
+    following = jnp.concatenate([value[:, 1:], last_value[:, None]], 1)
+    following = jnp.where(truncated, value, jnp.where(terminated, 0.0, following))
+    error = reward + discount * following - value
+
+    def backward(advantage, inputs):
+        error, done = inputs
+        advantage = error + discount * gae_lambda * jnp.where(done, 0.0, advantage)
+        return advantage, advantage
+
+    _, result = jax.lax.scan(backward, jnp.zeros_like(last_value), (error.T, done.T), reverse=True)
+    return result.T
+
+
+def make_policy_function(policy: Policy):
+    """The stochastic policy as `Locomotion.rollout` wants it; extra is the log density."""
+
+    def act(variables, key, descriptions, observation):
+        mean, std = policy.apply(variables, descriptions, observation)
+        action = mean + std * jax.random.normal(key, mean.shape) * descriptions.joint_mask
+        return action, log_prob(mean, std, action, descriptions.joint_mask)
+
+    return act
+
+
+def _at_steps(embedding, slot):
+    """Spread an embedding [B, 2, ...] of the two designs of a rollout over its steps [B, T]."""
+
+    def spread(x):
+        chosen = slot.reshape(slot.shape + (1,) * (x.ndim - 2)) > 0
+        return jnp.where(chosen, x[:, 1, None], x[:, 0, None])
+
+    return jax.tree.map(spread, embedding)
+
+
+def _apply(network, variables, descriptions, slot, observation):
+    """Network output at all steps [B, T], encoding each design once. descriptions: [B, 2]."""
+    embedding = network.apply(variables, descriptions, method="embed")
+    # The masks belong to the robot, not to the design, so either slot will do.
+    masks = jax.tree.map(lambda x: x[:, :1], descriptions)
+    return network.apply(variables, _at_steps(embedding, slot), masks, observation, method="act")
+
+
+def make_update(config: TrainConfig, policy: Policy, critic: Critic):
+    """The learner's iteration: (Learner, Trajectory, key) -> (Learner, metrics)."""
+    optimizer = optax.chain(
+        optax.clip_by_global_norm(config.max_gradient_norm), optax.scale_by_adam(eps=1e-5)
+    )
+    first_rate, last_rate = config.learning_rate
+    envs_per_minibatch = config.minibatch_size // config.rollout_length
+    minibatches = config.num_envs // envs_per_minibatch
+
+    def policy_loss(params, constants, batch):
+        variables = {"params": params, **constants}
+        mean, std = _apply(
+            policy, variables, batch["descriptions"], batch["slot"], batch["observation"]
+        )
+        mask = batch["descriptions"].joint_mask[:, :1]
+        logp = log_prob(mean, std, batch["action"], mask)
+        weight = batch["valid"] / jnp.maximum(jnp.sum(batch["valid"]), 1.0)
+        log_ratio = logp - batch["log_prob"]
+        ratio = jnp.exp(log_ratio)
+        clipped = jnp.clip(ratio, 1 - config.clip_range, 1 + config.clip_range)
+        advantage = batch["advantage"]
+        gain = jnp.minimum(ratio * advantage, clipped * advantage) * batch["importance"]
+        randomness = jnp.sum(entropy(std, mask) * weight)
+        loss = -jnp.sum(gain * weight) - config.entropy_coefficient * randomness
+        real = jnp.sum(mask * weight[..., None])
+        return loss, {
+            "kl": jnp.sum((ratio - 1 - log_ratio) * weight),
+            "clipped": jnp.sum((jnp.abs(ratio - 1) > config.clip_range) * weight),
+            "std": jnp.sum(std * mask * weight[..., None]) / real,
+        }
+
+    def critic_loss(params, constants, batch):
+        variables = {"params": params, **constants}
+        values = _apply(
+            critic, variables, batch["descriptions"], batch["slot"], batch["observation"]
+        )
+        weight = batch["valid"] / jnp.maximum(jnp.sum(batch["valid"]), 1.0)
+        error = jnp.mean((values - batch["target"][..., None]) ** 2, -1)
+        return 0.5 * jnp.sum(error * weight)
+
+    def step(variables, state, gradient, rate):
+        updates, state = optimizer.update(gradient, state)
+        params = jax.tree.map(lambda p, u: p - rate * u, variables["params"], updates)
+        return {**variables, "params": params}, state
+
+    def constants(variables):
+        return {k: v for k, v in variables.items() if k != "params"}
+
+    def minibatch_step(rate, batch, learner: Learner, stopped):
+        loss, gradient = jax.value_and_grad(critic_loss)(
+            learner.critic["params"], constants(learner.critic), batch
+        )
+        new_critic, critic_state = step(learner.critic, learner.critic_optimizer, gradient, rate)
+        metrics = {"value_loss": loss, "updates": jnp.ones(())}
+        new_policy, policy_state = learner.policy, learner.policy_optimizer
+        if config.learn_policy:
+            (_, more), gradient = jax.value_and_grad(policy_loss, has_aux=True)(
+                learner.policy["params"], constants(learner.policy), batch
+            )
+            new_policy, policy_state = step(new_policy, policy_state, gradient, rate)
+            metrics |= more
+            stopped = metrics["kl"] > config.kl_threshold
+        learner = replace(
+            learner,
+            policy=new_policy,
+            critic=new_critic,
+            policy_optimizer=policy_state,
+            critic_optimizer=critic_state,
+        )
+        return learner, stopped, metrics
+
+    @jax.jit
+    def update(learner: Learner, trajectory: Trajectory, key):
+        def by_env(x):
+            return jnp.swapaxes(x, 0, 1)
+
+        observation = jax.tree.map(by_env, trajectory.observation)
+        descriptions = jax.tree.map(by_env, trajectory.descriptions)
+        slot, valid = by_env(trajectory.slot), by_env(trajectory.valid)
+        reward = by_env(trajectory.reward)
+        value = jnp.mean(_apply(critic, learner.critic, descriptions, slot, observation), -1)
+        latest = jax.tree.map(lambda x: x[:, 1], descriptions)
+        last_value = jnp.mean(critic.apply(learner.critic, latest, trajectory.last_observation), -1)
+        advantage = advantages(
+            reward,
+            value,
+            last_value,
+            by_env(trajectory.terminated),
+            by_env(trajectory.truncated),
+            config.discount,
+            config.gae_lambda,
+        )
+        target = advantage + value
+        total = jnp.sum(valid)
+
+        def moments(x):
+            mean = jnp.sum(x * valid) / total
+            return mean, jnp.sum((x - mean) ** 2 * valid) / total
+
+        mean, variance = moments(advantage)
+        action, behaviour = by_env(trajectory.action), by_env(trajectory.extra)
+        batch = {
+            "observation": observation,
+            "descriptions": descriptions,
+            "slot": slot,
+            "valid": valid,
+            "action": action,
+            "target": target,
+            "advantage": (advantage - mean) / (jnp.sqrt(variance) + 1e-8),
+        }
+        if config.learn_policy:
+            policy_mean, std = _apply(policy, learner.policy, descriptions, slot, observation)
+            proximal = log_prob(policy_mean, std, action, descriptions.joint_mask[:, :1])
+            batch["log_prob"] = proximal
+            batch["importance"] = jnp.minimum(jnp.exp(proximal - behaviour), 2.0)
+
+        progress = jnp.minimum(learner.iteration / config.iterations, 1.0)
+        rate = first_rate + (last_rate - first_rate) * progress
+        names = ["value_loss", "updates"] + ["kl", "clipped", "std"] * config.learn_policy
+
+        def one(carry, rows):
+            learner, stopped = carry
+            part = jax.tree.map(lambda x: x[rows], batch)
+            # Once stopped, the rest of the iteration is skipped.
+            learner, stopped, metrics = jax.lax.cond(
+                stopped,
+                lambda learner: (learner, stopped, {name: jnp.zeros(()) for name in names}),
+                lambda learner: minibatch_step(rate, part, learner, stopped),
+                learner,
+            )
+            return (learner, stopped), metrics
+
+        orders = jax.vmap(lambda k: jax.random.permutation(k, config.num_envs))(
+            jax.random.split(key, config.epochs)
+        )
+        rows = orders.reshape(config.epochs * minibatches, envs_per_minibatch)
+        (learner, _), metrics = jax.lax.scan(one, (learner, jnp.asarray(False)), rows)
+        updates = jnp.maximum(jnp.sum(metrics["updates"]), 1.0)
+        metrics = {name: jnp.sum(x) / updates for name, x in metrics.items()}
+        _, residual = moments(target - value)
+        _, spread = moments(target)
+        metrics |= {
+            "learning_rate": rate,
+            "updates": updates,
+            "explained_variance": 1 - residual / jnp.maximum(spread, 1e-8),
+            "value": jnp.sum(value * valid) / total,
+        }
+        return replace(learner, iteration=learner.iteration + 1), metrics
+
+    def start(policy_variables, critic_variables) -> Learner:
+        return Learner(
+            policy=policy_variables,
+            critic=critic_variables,
+            policy_optimizer=optimizer.init(policy_variables["params"]),
+            critic_optimizer=optimizer.init(critic_variables["params"]),
+            iteration=jnp.zeros((), jnp.int32),
+        )
+
+    return update, start
+
+
+# ---------------------------------------------------------------------------- the run
+
+
+CURVE = (
+    "steps seconds return length tracking_error coefficient reward non_finite kl clipped std "
+    "value_loss explained_variance learning_rate steps_per_second"
+).split()
+"""Columns of curve.csv. return, length, tracking_error (m/s): means over the episodes that
+ended since the last row; coefficient and reward: means over steps; non_finite: episodes that
+were ended because the simulation became invalid."""
+
+CURVE_INTERVAL = 10
+"""Iterations per row of the learning curve."""
+
+
+class Trainer:
+    """A resumable training run.
+
+    Everything that determines its future is in `training.safetensors` in the agent's folder,
+    written after every iteration: a killed run continues as if nothing had happened and
+    repeats at most one rollout.
+
+    Args:
+        config: the run.
+        folder: the agent's folder; data/checkpoints/<name> if not given.
+        engine: see `Locomotion`.
+        policy: variables of a frozen policy, for the policy-evaluation phase.
+    """
+
+    def __init__(self, config: TrainConfig, folder=None, engine: str = "auto", policy=None):
+        self.config = config
+        self.folder = Path(folder) if folder else data_dir() / "checkpoints" / config.name
+        robots = [load_robot(name) for name in config.robots]
+        self.env = Locomotion(robots, config.num_envs, engine=engine, config=config.task)
+        self.policy, self.critic = Policy(config.policy), Critic(config.critic)
+        self.update, start = make_update(config, self.policy, self.critic)
+        self.act = make_policy_function(self.policy)
+        keys = jax.random.split(jax.random.PRNGKey(config.seed), 4)
+        self.key = keys[0]
+        constants = self._constants(keys[1], robots) if config.standardize else None
+        if policy is None:
+            policy = initialize(self.policy, keys[2], constants)
+        self.learner = start(policy, initialize(self.critic, keys[3], constants))
+        self.behaviour = self.learner.policy
+        self.seconds = 0.0
+        self.state = None
+        self.saved_physics = None
+
+    def _constants(self, key, robots):
+        batches = []
+        for i, robot in enumerate(robots):
+            space = DesignSpace(robot)
+            f = jax.random.uniform(
+                jax.random.fold_in(key, i), (512, space.dim), minval=-1.0, maxval=1.0
+            )
+            of = jax.jit(jax.vmap(lambda f, space=space, d=describe(robot): d(space(f))))
+            batches.append(of(f))
+        return standardization(*batches)
+
+    # -------------------------------------------------------------- state on disk
+
+    @property
+    def steps(self) -> int:
+        """Environment steps the learner has consumed."""
+        return int(self.learner.iteration) * self.config.batch
+
+    def _everything(self):
+        return {
+            "learner": self.learner,
+            "behaviour": self.behaviour,
+            "state": self.state,
+            "physics": self.saved_physics,
+            "seconds": np.float64(self.seconds),
+        }
+
+    def save(self) -> None:
+        """Write the training state."""
+        save_arrays(self.folder / "training.safetensors", self._everything())
+
+    def start(self) -> bool:
+        """Resume from the folder, or start afresh; True if resumed."""
+        coefficient = 0.0 if self.config.learn_policy else 1.0
+        self.state = self.env.reset(self.key, coefficient=coefficient, spread=True)
+        native = self.env.engine == "native"
+        self.saved_physics = self.env.physics_arrays() if native else self.env.physics_state
+        path = self.folder / "training.safetensors"
+        if not path.exists():
+            return False
+        saved = load_arrays(path, self._everything())
+        self.learner, self.behaviour = saved["learner"], saved["behaviour"]
+        self.state, self.seconds = saved["state"], float(saved["seconds"])
+        self.saved_physics = saved["physics"]
+        if native:
+            self.env.restore(self.state, self.saved_physics)
+        else:
+            self.env.physics_state = self.saved_physics
+        return True
+
+    def agent(self, states=None) -> Agent:
+        """The agent as trained so far."""
+        config = self.config
+        metadata = {
+            "config": _plain(asdict(config)),
+            "scale": config.scale,
+            "engine": self.env.engine,
+            "steps": self.steps,
+            "seconds": round(self.seconds, 1),
+            "machine": _machine(),
+        }
+        return Agent(
+            name=config.name,
+            robots=tuple(robot.name for robot in self.env.robots),
+            sizes=self.env.sizes,
+            policy_config=config.policy,
+            critic_config=config.critic,
+            policy=self.learner.policy,
+            critic=self.learner.critic,
+            states=None if states is None else states[0],
+            state_robots=None if states is None else states[1],
+            metadata=metadata,
+        )
+
+    # -------------------------------------------------------------- the loop
+
+    def _collect(self, behaviour, state, number):
+        key = jax.random.fold_in(self.key, 2 * number)
+        return self.env.rollout(self.act, behaviour, state, key, self.config.rollout_length)
+
+    def run(self, max_steps=None, max_seconds=None, progress=True) -> None:
+        """Train until the configured number of steps, or until a budget is used up.
+
+        Args:
+            max_steps: stop once this many steps in all have been consumed.
+            max_seconds: stop after this many seconds of this call.
+            progress: print a line every few seconds.
+        """
+        config = self.config
+        last = min(config.iterations, (max_steps or config.total_steps) // config.batch)
+        number = int(self.learner.iteration)
+        if number >= last:
+            return
+        self.folder.mkdir(parents=True, exist_ok=True)
+        curve = _Curve(self.folder / "curve.csv", self.steps)
+        report = _Report(config, progress)
+        # On an accelerator there is nothing to overlap: the device does one thing at a time.
+        overlap = self.env.engine == "native"
+        with ThreadPoolExecutor(1) as actor:
+            state, trajectory = self._collect(self.behaviour, self.state, number)
+            began = mark = time.monotonic()
+            while True:
+                # A snapshot from which the rollout below can be repeated.
+                self.state, self.behaviour = state, self.learner.policy
+                if overlap:
+                    self.saved_physics = self.env.physics_arrays()
+                    pending = actor.submit(self._collect, self.behaviour, state, number + 1)
+                key = jax.random.fold_in(self.key, 2 * number + 1)
+                self.learner, metrics = self.update(self.learner, trajectory, key)
+                metrics = {name: float(x) for name, x in metrics.items()}
+                if overlap:
+                    state, following = pending.result()
+                else:
+                    self.behaviour = self.learner.policy
+                    self.saved_physics = self.env.physics_state
+                number += 1
+                now = time.monotonic()
+                self.seconds, elapsed, mark = self.seconds + now - mark, now - mark, now
+                curve.add(trajectory, metrics, elapsed, config.batch)
+                if number % CURVE_INTERVAL == 0:
+                    curve.write(self.steps, self.seconds)
+                report.show(self.steps, curve)
+                self.save()
+                spent = max_seconds is not None and now - began >= max_seconds
+                if number >= last or spent:
+                    break
+                if not overlap:
+                    state, following = self._collect(self.behaviour, state, number)
+                trajectory = following
+        report.end()
+
+    def state_bank(self, rollouts: int = 8):
+        """States from rollouts of the policy over the full design space (Section 3.2).
+
+        Returns (Observation [M, ...] of numpy arrays, robot index int32[M]).
+        """
+        count = self.config.state_bank
+        env = self.env
+        state = env.reset(jax.random.fold_in(self.key, 1), coefficient=1.0, spread=True)
+        length = self.config.rollout_length
+        parts, robots, per = [], [], -(-count // rollouts)
+        owner = np.concatenate([np.full(g.count, i) for i, g in enumerate(env.groups)])
+        skip = max(1, 160 // length)
+        rng = np.random.default_rng(self.config.seed)
+        for r in range(rollouts):
+            # Rollouts far apart, so that states come from many moments of an episode.
+            for s in range(skip):
+                key = jax.random.fold_in(self.key, 1_000_003 + r * skip + s)
+                state, trajectory = env.rollout(self.act, self.learner.policy, state, key, length)
+            good = np.argwhere(np.asarray(trajectory.finite))
+            t, n = good[rng.choice(len(good), per, replace=per > len(good))].T
+            parts.append(
+                jax.tree.map(lambda x, t=t, n=n: np.asarray(x)[t, n], trajectory.observation)
+            )
+            robots.append(owner[n])
+        bank = jax.tree.map(lambda *x: np.concatenate(x)[:count].astype(np.float32), *parts)
+        return bank, np.concatenate(robots)[:count].astype(np.int32)
+
+
+def train(
+    config: TrainConfig,
+    folder=None,
+    progress: bool = True,
+    max_steps: int | None = None,
+    max_seconds: float | None = None,
+    engine: str = "auto",
+) -> Agent:
+    """Train an agent, or continue its training, and save it.
+
+    Args:
+        config: the run, for example `TrainConfig.reduced("unitree_go2")`.
+        folder: where the agent is kept; data/checkpoints/<name> by default. A run that was
+            stopped there is continued exactly where it was.
+        progress: print return, tracking error, curriculum coefficient, speed and time left.
+        max_steps, max_seconds: budgets of this call; the run can be continued later.
+        engine: "auto", "native" or "mjx".
+
+    Returns:
+        The agent, with its state bank.
+    """
+    trainer = Trainer(config, folder, engine)
+    trainer.start()
+    return _run_and_save(trainer, progress, max_steps, max_seconds)
+
+
+def train_critic(
+    agent: Agent,
+    critic: CriticConfig,
+    steps: int = 4_000_000,
+    folder=None,
+    name: str | None = None,
+    progress: bool = True,
+    max_seconds: float | None = None,
+    engine: str = "auto",
+    **changes,
+) -> Agent:
+    """Policy evaluation: train a new critic for a frozen policy over the full design space.
+
+    The agent's policy acts (with its exploration noise) on designs f ~ U([-1, 1]^d); the critic
+    learns its TD(lambda) returns. `changes` replace fields of the TrainConfig; by default
+    gae_lambda is 0.95.
+
+    Returns:
+        The agent with the new critic and a new state bank, saved in `folder`
+        (data/checkpoints/<name>, by default "<agent>_critic").
+    """
+    name = name or f"{agent.name}_critic"
+    base = TrainConfig.at_scale(agent.metadata["scale"], agent.robots[0])
+    config = replace(
+        base,
+        **{
+            "name": name,
+            "robots": agent.robots,
+            "policy": agent.policy_config,
+            "critic": critic,
+            "standardize": True,
+            "learn_policy": False,
+            "gae_lambda": 0.95,
+            "total_steps": steps,
+            **changes,
+        },
+    )
+    trainer = Trainer(config, folder, engine, policy=agent.policy)
+    trainer.start()
+    return _run_and_save(trainer, progress, None, max_seconds)
+
+
+def _run_and_save(trainer: Trainer, progress, max_steps, max_seconds) -> Agent:
+    try:
+        trainer.run(max_steps, max_seconds, progress)
+    except KeyboardInterrupt:
+        # The training state on disk is whole; the agent below is the learner's latest.
+        if progress:
+            print("\ninterrupted: saved, the same call continues", flush=True)
+    agent = trainer.agent(trainer.state_bank())
+    save_agent(agent, trainer.folder)
+    return agent
+
+
+class _Curve:
+    """Averages over iterations, appended to curve.csv. Rows after the resumed step go."""
+
+    def __init__(self, path: Path, steps: int):
+        self.path = path
+        rows = []
+        if path.exists():
+            with path.open() as file:
+                rows = [row for row in csv.DictReader(file) if int(row["steps"]) <= steps]
+        with _replacing(path) as file:
+            writer = csv.DictWriter(file, CURVE)
+            writer.writeheader()
+            writer.writerows(rows)
+        self.latest = {}
+        self.episodes = (0, 0.0, 0.0, 0.0)
+        self._clear()
+
+    def _clear(self):
+        self.sums, self.count, self.ended = {}, 0, []
+
+    def add(self, trajectory: Trajectory, metrics, seconds, batch):
+        done = np.asarray(trajectory.terminated) | np.asarray(trajectory.truncated)
+        columns = (
+            trajectory.episode_return,
+            trajectory.episode_length,
+            trajectory.episode_error,
+        )
+        self.ended.append(np.stack([np.asarray(x)[done] for x in columns], -1))
+        values = {
+            **metrics,
+            "seconds": seconds,
+            "batch": batch,
+            "coefficient": float(np.mean(trajectory.coefficient)),
+            "reward": float(np.mean(trajectory.reward)),
+            "non_finite": float(np.sum(~np.asarray(trajectory.finite))),
+        }
+        self.count += 1
+        for name, value in values.items():
+            self.sums[name] = self.sums.get(name, 0.0) + value
+        self.latest = self._row()
+
+    def _row(self):
+        row = {name: self.sums[name] / self.count for name in CURVE if name in self.sums}
+        ended = np.concatenate(self.ended)
+        if len(ended):
+            row |= dict(
+                zip(("return", "length", "tracking_error"), ended.mean(0).tolist(), strict=True)
+            )
+        row["non_finite"] = self.sums["non_finite"]
+        row["steps_per_second"] = self.sums["batch"] / max(self.sums["seconds"], 1e-9)
+        return row
+
+    def write(self, steps, seconds):
+        row = {"steps": steps, "seconds": round(seconds, 1)}
+        row |= {
+            name: f"{value:.5g}"
+            for name, value in self._row().items()
+            if name in CURVE and name != "seconds"
+        }
+        with self.path.open("a", newline="") as file:
+            csv.DictWriter(file, CURVE).writerow(row)
+        self._clear()
+
+
+class _Report:
+    """One progress line every few seconds, rewritten in place on a terminal."""
+
+    def __init__(self, config: TrainConfig, active: bool, interval: float = 5.0):
+        self.config, self.active = config, active
+        self.interactive = sys.stdout.isatty() or "ipykernel" in sys.modules
+        self.interval = interval if self.interactive else 12 * interval
+        self.next = 0.0
+        self.speed = None
+
+    def show(self, steps: int, curve: _Curve):
+        now = time.monotonic()
+        if not self.active or now < self.next:
+            return
+        self.next = now + self.interval
+        row = curve.latest
+        left = (self.config.total_steps - steps) / max(row["steps_per_second"], 1e-9)
+        line = (
+            f"{steps:>12,} steps  return {row.get('return', float('nan')):6.2f}  "
+            f"xy error {row.get('tracking_error', float('nan')):.3f} m/s  "
+            f"c {row['coefficient']:.2f}  {row['steps_per_second']:,.0f} steps/s  "
+            f"{_duration(left)} left"
+        )
+        print(
+            ("\r" if self.interactive else "") + line,
+            flush=True,
+            end="" if self.interactive else "\n",
+        )
+
+    def end(self):
+        if self.active and self.interactive:
+            print(flush=True)
+
+
+def _duration(seconds: float) -> str:
+    minutes = int(seconds // 60)
+    return (
+        f"{minutes // 60}h{minutes % 60:02d}"
+        if minutes >= 60
+        else f"{minutes}m{int(seconds) % 60:02d}"
+    )
+
+
+class _replacing:
+    """Open a text file for writing that replaces `path` only when complete."""
+
+    def __init__(self, path: Path):
+        self.path, self.temporary = path, path.with_name(path.name + ".tmp")
+
+    def __enter__(self):
+        self.file = self.temporary.open("w", newline="")
+        return self.file
+
+    def __exit__(self, kind, value, traceback):
+        self.file.close()
+        if kind is None:
+            os.replace(self.temporary, self.path)
+
+
+def _plain(value):
+    """Dataclass dictionaries as JSON: tuples become lists."""
+    if isinstance(value, dict):
+        return {k: _plain(v) for k, v in value.items()}
+    if isinstance(value, (tuple, list)):
+        return [_plain(v) for v in value]
+    return value
+
+
+def _machine() -> str:
+    return f"{platform.machine()}, {os.cpu_count()} CPU cores, {jax.default_backend()}"
