@@ -20,7 +20,6 @@ import sys
 import time
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass, field, replace
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -30,7 +29,7 @@ import numpy as np
 import optax
 
 from shapebody.checkpoints import Agent, load_arrays, save_agent, save_arrays
-from shapebody.descriptions import Sizes, describe
+from shapebody.descriptions import describe
 from shapebody.design import DesignSpace
 from shapebody.locomotion import Locomotion, TaskConfig, Trajectory
 from shapebody.networks import (
@@ -435,14 +434,14 @@ class Trainer:
         self.saved_physics = None
 
     def _constants(self, key, robots):
+        """Input standardization over the designs of all robots."""
         batches = []
         for i, robot in enumerate(robots):
-            space = DesignSpace(robot)
-            f = jax.random.uniform(
-                jax.random.fold_in(key, i), (512, space.dim), minval=-1.0, maxval=1.0
-            )
-            of = jax.jit(jax.vmap(lambda f, space=space, d=describe(robot): d(space(f))))
-            batches.append(of(f))
+            space, to_descriptions = DesignSpace(robot), describe(robot)
+            keys = jax.random.fold_in(key, i)
+            f = jax.random.uniform(keys, (512, space.dim), minval=-1.0, maxval=1.0)
+            embodiments = jax.jit(jax.vmap(space))(f)
+            batches.append(jax.jit(jax.vmap(to_descriptions))(embodiments))
         return standardization(*batches)
 
     # -------------------------------------------------------------- state on disk

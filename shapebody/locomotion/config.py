@@ -71,7 +71,7 @@ class TaskConfig:
     curriculum_levels: int = 100
     """A streak of n successful episodes raises c by n over this number."""
     curriculum_error: float = 0.4
-    """Success needs a mean velocity error per axis of at most this share of the command limit ..."""
+    """Success needs a mean velocity error per axis of at most this x the command limit ..."""
     curriculum_length: int = 500
     """... and at least this many control steps."""
 
