@@ -7,7 +7,10 @@ order.
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
+import io
+import itertools
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -15,10 +18,13 @@ import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
-from mujoco import mjx
 
 from shapebody.design import MODEL_FIELDS
 from shapebody.physics import MAX_VALUE, _at_least_one, home_sensordata, prepare
+
+with contextlib.redirect_stdout(io.StringIO()):  # It prints that the optional Warp is missing.
+    from mujoco import mjx
+    from mujoco.mjx._src import collision_driver, math
 
 if TYPE_CHECKING:
     from shapebody.design import Embodiment
@@ -191,7 +197,8 @@ class MjxPhysics:
         def substep(carry, _):
             qpos, qvel, warmstart, _, finite = carry
             data = self._mjx_data.replace(qpos=qpos, qvel=qvel, qacc_warmstart=warmstart, ctrl=ctrl)
-            data = mjx.step(model, data)
+            with _box_contacts_as_in_c():
+                data = mjx.step(model, data)
             finite &= _valid(data.qacc) & _valid(data.qpos) & _valid(data.qvel)
             return (data.qpos, data.qvel, data.qacc_warmstart, data.sensordata, finite), None
 
@@ -208,6 +215,40 @@ class MjxPhysics:
                 f"{(self.num_envs, size)} or {(size,)}"
             )
         return jnp.broadcast_to(value, (self.num_envs, size))
+
+
+def _plane_box(model, data, key, geoms):
+    """Contacts of boxes with planes: the four lowest corners of each box, as in C MuJoCo.
+
+    MJX's own function leaves out corners more than 1 mm above the lowest one, so that a foot
+    which lands at an angle would be pushed up at one edge only.
+    """
+    del key
+    plane, box = geoms.T
+    normal = data.geom_xmat[plane][:, :, 2]
+    signs = jnp.array(list(itertools.product((-1.0, 1.0), repeat=3)), data.qpos.dtype)
+    local = signs * model.geom_size[box][:, None]
+    corners = data.geom_xpos[box][:, None] + jnp.einsum("bij,bcj->bci", data.geom_xmat[box], local)
+    height = jnp.einsum("bci,bi->bc", corners - data.geom_xpos[plane][:, None], normal)
+    depth, lowest = jax.lax.top_k(-height, _plane_box.ncon)
+    corners = jnp.take_along_axis(corners, lowest[:, :, None], axis=1)
+    middle = corners + 0.5 * depth[:, :, None] * normal[:, None]
+    frames = jnp.repeat(jax.vmap(math.make_frame)(normal), _plane_box.ncon, axis=0)
+    return -depth.reshape(-1), middle.reshape(-1, 3), frames
+
+
+_plane_box.ncon = 4
+
+
+@contextlib.contextmanager
+def _box_contacts_as_in_c():
+    # MJX has no public way to replace a collision function; this holds while JAX traces a step.
+    functions, key = collision_driver._COLLISION_FUNC, (mjx.GeomType.PLANE, mjx.GeomType.BOX)
+    original, functions[key] = functions[key], _plane_box
+    try:
+        yield
+    finally:
+        functions[key] = original
 
 
 def _valid(values: jax.Array) -> jax.Array:
