@@ -56,7 +56,7 @@ class Trajectory:
     last_observation: Observation  # [N, ...] after the last step
     episode_return: jax.Array  # [T, N] return so far, episode_length likewise
     episode_length: jax.Array
-    episode_error: jax.Array  # [T, N] mean ||v_xy - c_xy||_2 so far, m/s
+    episode_error: jax.Array  # [T, N] mean over time and axes of |v_xy - c_xy| so far, m/s
     coefficient: jax.Array  # [T, N] curriculum coefficient
 
 
@@ -87,6 +87,7 @@ class _Group:
         self.start = jax.vmap(
             _starter(robot, self.space, sizes, config, design_dim), in_axes=(0, 0, 0, 0)
         )
+        self.start_chunk = jax.jit(self.start)
         self.qvel_index = np.asarray(robot.qvel_index)
 
 
@@ -193,9 +194,7 @@ class Locomotion:
 
             for group in self.groups:
                 group.physics = MjxPhysics(group.robot, group.count, **options)
-        self._starts = [jax.jit(group.start) for group in self.groups]
         self._advance_jit = jax.jit(self._advance)
-        self._scatter = jax.jit(_scatter)
         self._steps: dict[Any, Callable] = {}
         self.physics_state = None
 
@@ -247,17 +246,17 @@ class Locomotion:
             designs = np.asarray(designs, np.float32)
             designs = np.broadcast_to(designs, (n, designs.shape[-1]))
         states, physics_states = [], []
-        for group, start in zip(self.groups, self._starts, strict=True):
+        for group in self.groups:
             s = group.slice
-            f = jnp.asarray(designs[s, : group.space.dim])
-            state, embodiment, qpos, qvel = start(keys[s], f, coefficients[s], streaks[s])
-            states.append(state)
+            f = designs[s, : group.space.dim]
             if self.engine == "native":
                 ids = np.arange(group.count)
-                group.physics.set_designs(ids, embodiment)
-                group.physics.set_state(ids, np.asarray(qpos), np.asarray(qvel))
+                states += self._begin(group, ids, keys[s], f, coefficients[s], streaks[s])
             else:
-                physics_states.append(group.physics.init(embodiment, qpos, qvel))
+                start = jax.jit(group.start)
+                state, *physics = start(keys[s], jnp.asarray(f), coefficients[s], streaks[s])
+                states.append(state)
+                physics_states.append(group.physics.init(*physics))
         state = jax.tree.map(lambda *x: jnp.concatenate(x), *states)
         if spread:
             horizon = jax.random.randint(
@@ -267,26 +266,40 @@ class Locomotion:
         self.physics_state = tuple(physics_states)
         return state
 
+    def _begin(self, group, ids, keys, designs, coefficients, streaks) -> list[Episode]:
+        """Native engine: start episodes in environments `ids` of a group, RESET_SLOTS at a
+        time, so that one compiled function serves any number of them. `designs` None draws them."""
+        states = []
+        keys, coefficients, streaks = (np.asarray(x) for x in (keys, coefficients, streaks))
+        for at in range(0, len(ids), RESET_SLOTS):
+            chosen = ids[at : at + RESET_SLOTS]
+            m = len(chosen)
+            # Unused slots repeat the first one.
+            rows = np.concatenate([np.arange(at, at + m), np.full(RESET_SLOTS - m, at)])
+            k, c = keys[rows], coefficients[rows]
+            f = _draw_designs(k, c, group.space.dim) if designs is None else designs[rows]
+            state, embodiment, qpos, qvel = group.start_chunk(k, f, c, streaks[rows])
+            state, embodiment, qpos, qvel = jax.tree.map(
+                lambda x, m=m: np.asarray(x)[:m], (state, embodiment, qpos, qvel)
+            )
+            group.physics.set_designs(chosen, embodiment)
+            group.physics.set_state(chosen, qpos, qvel)
+            states.append(state)
+        return states
+
     def _restart(self, state: Episode, done: np.ndarray, following) -> Episode:
         """Native engine: new episodes for the finished environments."""
         coefficient, streak, keys = (np.asarray(x) for x in following)
-        for group, start in zip(self.groups, self._starts, strict=True):
-            finished = np.flatnonzero(done[group.slice])
-            for at in range(0, len(finished), RESET_SLOTS):
-                local = finished[at : at + RESET_SLOTS]
-                slots = np.full(RESET_SLOTS, local[0])
-                slots[: len(local)] = local
-                rows = slots + group.first
-                c, k = coefficient[rows], keys[rows]
-                designs = _draw_designs(k, c, group.space.dim)
-                fresh, embodiment, qpos, qvel = start(k, designs, c, streak[rows])
-                m = len(local)
-                group.physics.set_designs(
-                    local, jax.tree.map(lambda x, m=m: np.asarray(x)[:m], embodiment)
-                )
-                group.physics.set_state(local, np.asarray(qpos)[:m], np.asarray(qvel)[:m])
-                # Slots beyond the finished ones repeat the first: the same row, written twice.
-                state = self._scatter(state, rows, fresh)
+        for group in self.groups:
+            ids = np.flatnonzero(done[group.slice])
+            if not len(ids):
+                continue
+            rows = ids + group.first
+            fresh = self._begin(group, ids, keys[rows], None, coefficient[rows], streak[rows])
+            fresh = jax.tree.map(lambda *x: np.concatenate(x), *fresh)
+            state = jax.tree.map(
+                lambda old, new, rows=rows: _replaced(old, rows, new), state, fresh
+            )
         return state
 
     # ------------------------------------------------------------------ rollouts
@@ -454,7 +467,7 @@ def _record(state: Episode, observation, action, extra, outcome: Outcome) -> Ste
         finite=outcome.finite,
         episode_return=state.total_reward,
         episode_length=state.step,
-        episode_error=state.total_distance / jnp.maximum(state.step, 1),
+        episode_error=state.total_error / jnp.maximum(state.step, 1),
         coefficient=state.coefficient,
     )
 
@@ -463,8 +476,10 @@ def _f32(x):
     return np.asarray(x, np.float32)
 
 
-def _scatter(state, rows, fresh):
-    return jax.tree.map(lambda old, new: old.at[rows].set(new), state, fresh)
+def _replaced(old, rows, new):
+    result = np.array(old)
+    result[rows] = new
+    return result
 
 
 @jax.jit

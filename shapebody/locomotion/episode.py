@@ -41,7 +41,6 @@ class Episode:
     air_time: jax.Array  # [F] s
     total_reward: jax.Array  # [] return so far
     total_error: jax.Array  # [] sum over steps of the mean per-axis |v_xy - c_xy|
-    total_distance: jax.Array  # [] sum over steps of ||v_xy - c_xy||_2
 
 
 class Outcome(NamedTuple):
@@ -95,7 +94,6 @@ def start(
         air_time=jnp.zeros(feet),
         total_reward=zero,
         total_error=zero,
-        total_distance=zero,
     )
 
 
@@ -198,7 +196,6 @@ def advance(config: TaskConfig, episode: Episode, readings: Readings):
         air_time=jnp.where(contact > 0, 0.0, episode.air_time + CONTROL_STEP),
         total_reward=episode.total_reward + reward,
         total_error=episode.total_error + error,
-        total_distance=episode.total_distance + jnp.sqrt(jnp.sum(difference**2)),
     )
     return episode, Outcome(reward, terms, terminated, truncated, finite)
 
