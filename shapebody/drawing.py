@@ -80,6 +80,41 @@ def colour(model: mujoco.MjModel, geom: int) -> np.ndarray:
     return rgba.copy()
 
 
+def bones(model: mujoco.MjModel, data: mujoco.MjData) -> tuple[np.ndarray, np.ndarray]:
+    """Where to draw rods so that a changed design hangs together: starts and ends, float64[n, 3].
+
+    A design moves joints and feet, but the shapes of the links between them keep their size.
+    """
+    moving = [body for body in range(2, model.nbody) if model.body_parentid[body] > 0]
+    feet = [
+        geom
+        for geom in range(model.ngeom)
+        if model.geom_bodyid[geom] > 0 and "foot" in model.geom(geom).name
+    ]
+    starts = [data.xpos[model.body_parentid[body]] for body in moving]
+    ends = [data.xpos[body] for body in moving]
+    starts += [data.xpos[model.geom_bodyid[geom]] for geom in feet]
+    ends += [data.geom_xpos[geom] for geom in feet]
+    starts, ends = np.reshape(starts, (-1, 3)), np.reshape(ends, (-1, 3))
+    return starts, ends
+
+
+def bone_radius(model: mujoco.MjModel) -> float:
+    """Radius of the rods in m."""
+    return 0.011 * float(model.stat.extent)
+
+
+BONE_COLOUR = (0.42, 0.45, 0.50, 1.0)
+
+
+def rotation_to(direction: np.ndarray) -> np.ndarray:
+    """float64[3, 3], a rotation whose third column is along `direction`[3]."""
+    quaternion, matrix = np.zeros(4), np.zeros(9)
+    mujoco.mju_quatZ2Vec(quaternion, np.asarray(direction, float))
+    mujoco.mju_quat2Mat(matrix, quaternion)
+    return matrix.reshape(3, 3)
+
+
 def view_axes(azimuth: float, elevation: float) -> np.ndarray:
     """float64[3, 3], rows right, up and forward of MuJoCo's free camera; angles in degrees."""
     az, el = np.radians([azimuth, elevation])
@@ -122,18 +157,32 @@ def draw(
     canvas = ImageDraw.Draw(picture)
     _draw_floor(canvas, project, np.asarray(lookat), forward, distance)
 
+    shapes = [
+        (
+            surface(model.geom_type[geom], model.geom_size[geom]),
+            data.geom_xmat[geom].reshape(3, 3),
+            data.geom_xpos[geom],
+            colour(model, geom),
+        )
+        for geom in geoms
+    ]
+    for start, end in zip(*bones(model, data), strict=True):
+        # Sorting by distance cannot show a rod inside the trunk as hidden.
+        if np.array_equal(start, data.xpos[1]):
+            continue
+        size = np.array([bone_radius(model), np.linalg.norm(end - start) / 2, 0])
+        rod = surface(_GEOM.mjGEOM_CAPSULE, size)
+        shapes.append((rod, rotation_to(end - start), (start + end) / 2, np.array(BONE_COLOUR)))
     quads, normals, colours = [], [], []
-    for geom in geoms:
-        local = surface(model.geom_type[geom], model.geom_size[geom])
+    for local, rotation, position, rgba in shapes:
         if local is None:
             continue
-        world = local @ data.geom_xmat[geom].reshape(3, 3).T + data.geom_xpos[geom]
-        diagonals = world[:, 2] - world[:, 0], world[:, 3] - world[:, 1]
-        normal = np.cross(*diagonals)
+        world = local @ rotation.T + position
+        normal = np.cross(world[:, 2] - world[:, 0], world[:, 3] - world[:, 1])
         normal /= np.linalg.norm(normal, axis=-1, keepdims=True) + 1e-12
         quads.append(world)
         normals.append(normal)
-        colours.append(np.broadcast_to(colour(model, geom)[:3], (len(world), 3)))
+        colours.append(np.broadcast_to(rgba[:3], (len(world), 3)))
     if quads:
         quads, normals = np.concatenate(quads), np.concatenate(normals)
         brightness = 0.55 + 0.45 * np.clip(normals @ _LIGHT, -0.4, 1)

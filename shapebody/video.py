@@ -51,7 +51,7 @@ _NO_FFMPEG = (
 
 
 @functools.cache
-def opengl() -> str | None:
+def find_opengl() -> str | None:
     """Name of the OpenGL interface that works here ("egl", "osmesa", "glfw", "cgl"), or None.
 
     Honours MUJOCO_GL ("off" forbids OpenGL). Each candidate is tried once in a process of its own,
@@ -98,6 +98,7 @@ class Renderer:
     """Pictures of one model. A context manager, because a renderer left open holds OpenGL state.
 
     spheres: also show the collision spheres. smooth: four samples per pixel, for stills.
+    opengl: False draws without OpenGL, even where there is one.
 
     >>> with Renderer(model, height=240, width=320) as renderer:
     ...     picture = renderer.picture(qpos)
@@ -110,6 +111,7 @@ class Renderer:
         width: int = 480,
         spheres: bool = False,
         smooth: bool = False,
+        opengl: bool = True,
     ):
         if min(height, width) < 16:
             raise ValueError(
@@ -129,13 +131,14 @@ class Renderer:
             np.isin(drawn.geom_group, groups) & (drawn.geom_type != mujoco.mjtGeom.mjGEOM_PLANE)
         )
         self._context = self._pixels = None
-        if opengl():
+        interface = find_opengl() if opengl else None
+        if interface:
             try:
-                self._open(opengl(), groups, rows, columns)
+                self._open(interface, groups, rows, columns)
             except Exception as error:  # the kinds differ by interface, and a drawing is enough
-                _say(f"OpenGL ({opengl()}) failed with {error!r}, so robots are drawn instead.")
+                _say(f"OpenGL ({interface}) failed with {error!r}, so robots are drawn instead.")
                 self._context = self._pixels = None
-        else:
+        elif opengl:
             _say(_NO_OPENGL)
 
     def _open(self, name, groups, rows, columns):
@@ -143,7 +146,7 @@ class Renderer:
         self._context.make_current()
         self._pixels = mujoco.MjrContext(self.model, mujoco.mjtFontScale.mjFONTSCALE_100.value)
         mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN.value, self._pixels)
-        self._scene = mujoco.MjvScene(self.model, maxgeom=self.model.ngeom + 100)
+        self._scene = mujoco.MjvScene(self.model, maxgeom=2 * self.model.ngeom + 200)
         for flag in ("SHADOW", "REFLECTION", "HAZE"):
             self._scene.flags[getattr(mujoco.mjtRndFlag, f"mjRND_{flag}")] = False
         self._option = mujoco.MjvOption()
@@ -153,6 +156,16 @@ class Renderer:
         self._option.actuatorgroup[:] = 0
         self._camera = mujoco.MjvCamera()
         self._rectangle = mujoco.MjrRect(0, 0, columns, rows)
+
+    def _add_bones(self):
+        radius = drawing.bone_radius(self.model)
+        capsule = mujoco.mjtGeom.mjGEOM_CAPSULE
+        colour = np.array(drawing.BONE_COLOUR, np.float32)
+        for start, end in zip(*drawing.bones(self.model, self.data), strict=True):
+            rod = self._scene.geoms[self._scene.ngeom]
+            mujoco.mjv_initGeom(rod, capsule, np.zeros(3), np.zeros(3), np.zeros(9), colour)
+            mujoco.mjv_connector(rod, capsule, radius, start, end)
+            self._scene.ngeom += 1
 
     def close(self) -> None:
         """Free the OpenGL context. May be called twice."""
@@ -233,6 +246,7 @@ class Renderer:
             mujoco.mjtCatBit.mjCAT_ALL.value,
             self._scene,
         )
+        self._add_bones()
         mujoco.mjr_render(self._rectangle, self._scene, self._pixels)
         rows, columns = self._rectangle.height, self._rectangle.width
         flipped = np.empty((rows, columns, 3), np.uint8)

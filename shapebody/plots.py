@@ -1,0 +1,163 @@
+"""House style of the figures, learning curves, and the table "paper | ours"."""
+
+import csv
+import html
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import matplotlib as mpl
+import matplotlib.pyplot as plt
+import numpy as np
+
+# Okabe and Ito's colours stay distinct for colour-blind readers.
+COLOURS = {
+    "blue": "#0072B2",
+    "orange": "#E69F00",
+    "green": "#009E73",
+    "red": "#D55E00",
+    "purple": "#CC79A7",
+    "sky": "#56B4E9",
+    "yellow": "#F0E442",
+    "black": "#222222",
+}
+PAPER = "#8A8F98"
+"""Grey of every number taken from the paper."""
+DIVERGING = "PuOr_r"
+"""Colour map of signed quantities such as f in [-1, 1]; centre it on zero."""
+
+
+def use_style() -> None:
+    """Set Matplotlib's defaults: 100 dpi (small notebooks), quiet axes, colour-blind safe."""
+    mpl.rcParams.update(
+        {
+            "figure.dpi": 100,
+            "savefig.dpi": 100,
+            "figure.figsize": (7.0, 3.4),
+            "figure.constrained_layout.use": True,
+            "axes.prop_cycle": mpl.cycler(color=list(COLOURS.values())),
+            "axes.spines.top": False,
+            "axes.spines.right": False,
+            "axes.grid": True,
+            "axes.axisbelow": True,
+            "axes.titlesize": "medium",
+            "grid.color": "#E3E5E8",
+            "grid.linewidth": 0.7,
+            "lines.linewidth": 1.8,
+            "legend.frameon": False,
+            "image.cmap": "viridis",
+            "svg.hashsalt": "shapebody",
+        }
+    )
+
+
+def read_curve(path: str | Path) -> dict[str, np.ndarray]:
+    """Columns of a learning curve (`curve.csv` of an agent) as float arrays of one length."""
+    with open(path, newline="", encoding="utf-8") as file:
+        rows = list(csv.DictReader(file))
+    if not rows:
+        raise ValueError(f"{path} holds no rows; expected a header and one line per record")
+    return {
+        name: np.array([float(row[name]) if row[name] else np.nan for row in rows])
+        for name in rows[0]
+    }
+
+
+def learning_curve(path: str | Path, y: str, x: str = "steps", ax=None, smooth: int = 1, **style):
+    """Plot column `y` of a learning curve over column `x`; returns the axes.
+
+    smooth: number of records averaged; above 1, the raw values are shown faintly behind.
+    Raises ValueError for a column that the file does not have.
+    """
+    columns = read_curve(path)
+    for name in (x, y):
+        if name not in columns:
+            raise ValueError(f"{path} has no column {name!r}; it has {', '.join(columns)}")
+    ax = ax or plt.gca()
+    values = columns[y]
+    if smooth > 1:
+        weights = np.ones(smooth)
+        present = np.isfinite(values)
+        total = np.convolve(np.where(present, values, 0), weights, mode="same")
+        smoothed = total / np.maximum(np.convolve(present, weights, mode="same"), 1)
+        (line,) = ax.plot(columns[x], smoothed, **style)
+        ax.plot(columns[x], values, color=line.get_color(), alpha=0.25, linewidth=0.8)
+    else:
+        ax.plot(columns[x], values, **style)
+    ax.set(xlabel="training steps" if x == "steps" else x, ylabel=y.replace("_", " "))
+    return ax
+
+
+@dataclass(frozen=True)
+class Table:
+    """A table that a notebook shows as HTML, and a terminal as text."""
+
+    header: tuple[str, ...]
+    rows: tuple[tuple[str, ...], ...]
+    caption: str = ""
+
+    def markdown(self) -> str:
+        rule = ["---"] + ["---:"] * (len(self.header) - 1)
+        lines = ["| " + " | ".join(row) + " |" for row in (self.header, rule, *self.rows)]
+        return "\n".join(([self.caption, ""] if self.caption else []) + lines)
+
+    def __str__(self) -> str:
+        columns = list(zip(self.header, *self.rows, strict=True))
+        widths = [max(len(cell) for cell in column) for column in columns]
+        lines = [
+            "  ".join(
+                [row[0].ljust(widths[0])]
+                + [cell.rjust(width) for cell, width in zip(row[1:], widths[1:], strict=True)]
+            )
+            for row in (self.header, *self.rows)
+        ]
+        return "\n".join(([self.caption] if self.caption else []) + lines)
+
+    __repr__ = __str__
+
+    def _repr_html_(self) -> str:
+        def cells(row, tag):
+            aligned = ["left"] + ["right"] * (len(row) - 1)
+            return "".join(
+                f'<{tag} style="text-align: {side}">{html.escape(cell)}</{tag}>'
+                for side, cell in zip(aligned, row, strict=True)
+            )
+
+        body = "".join(f"<tr>{cells(row, 'td')}</tr>" for row in self.rows)
+        caption = f"<caption>{html.escape(self.caption)}</caption>" if self.caption else ""
+        return (
+            f"<table>{caption}<thead><tr>{cells(self.header, 'th')}</tr></thead>"
+            f"<tbody>{body}</tbody></table>"
+        )
+
+
+def table(rows: Iterable[Sequence], header: Sequence[str], digits: int = 2, caption: str = ""):
+    """Table of values. A number gets `digits` decimals, a pair (m, h) becomes "m ± h", None "–"."""
+    header = tuple(str(cell) for cell in header)
+    rows = tuple(tuple(_text(cell, digits) for cell in row) for row in rows)
+    for row in rows:
+        if len(row) != len(header):
+            raise ValueError(f"row {row} has {len(row)} cells for the {len(header)} of {header}")
+    return Table(header, rows, caption)
+
+
+def paper_table(rows: Iterable[Sequence], digits: int = 2, caption: str = "", note: str = "ours"):
+    """Table "quantity | paper | ours". rows: (quantity, paper's value, our value).
+
+    Values as in `table`. note: header of our column, best with scale and engine.
+    """
+    return table(rows, ("", "paper", note), digits, caption)
+
+
+def _text(value, digits) -> str:
+    if value is None:
+        return "–"
+    if isinstance(value, str):
+        return value
+    if isinstance(value, tuple | list) and len(value) == 2:
+        return f"{_text(value[0], digits)} ± {_text(value[1], digits)}"
+    if isinstance(value, bool | np.bool_):
+        return "yes" if value else "no"
+    if isinstance(value, int | np.integer):
+        return f"{value:,}"
+    return f"{float(value):.{digits}f}" if np.isfinite(value) else "–"

@@ -1,0 +1,85 @@
+"""What a process sets up once: the compilation cache, and the first cell of a notebook."""
+
+import hashlib
+import os
+import platform
+import sys
+from pathlib import Path
+
+
+def cache_folder() -> Path:
+    """Where compiled programs are kept between runs.
+
+    JAX_COMPILATION_CACHE_DIR if set; otherwise `shapebody/jax` in the user's cache folder, with one
+    subfolder per processor type, because compiled CPU programs do not run on every processor.
+    """
+    chosen = os.environ.get("JAX_COMPILATION_CACHE_DIR")
+    if chosen:
+        return Path(chosen).expanduser()
+    if sys.platform == "darwin":
+        base = Path.home() / "Library" / "Caches"
+    else:
+        base = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
+    return base / "shapebody" / "jax" / _processor()
+
+
+def _processor() -> str:
+    description = platform.machine() + platform.processor()
+    try:
+        lines = Path("/proc/cpuinfo").read_text().splitlines()
+        description += next(line for line in lines if line.startswith(("flags", "Features")))
+    except (OSError, StopIteration):
+        pass
+    return hashlib.sha256(description.encode()).hexdigest()[:12]
+
+
+def enable_compilation_cache() -> Path | None:
+    """Keep compiled programs on disk, so that a second run starts in a fraction of the time.
+
+    Returns the folder, or None where it cannot be written (the cache then stays off). JAX's own
+    JAX_ENABLE_COMPILATION_CACHE=false also switches it off. Starts no JAX backend; call it before
+    the first compilation.
+    """
+    import jax
+
+    folder = cache_folder()
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError:
+        return None
+    if not os.access(folder, os.W_OK):
+        return None
+    jax.config.update("jax_compilation_cache_dir", str(folder))
+    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.5)
+    return folder
+
+
+def start_notebook() -> None:
+    """Set up a notebook and print one line with the versions its results were made with.
+
+    Compilation cache, house style of figures, off-screen OpenGL (MUJOCO_GL is set where nothing
+    else is and there is no display), and no preallocation of GPU memory, so that two notebooks can
+    share one GPU. Every step respects settings made before.
+    """
+    os.environ.setdefault("XLA_PYTHON_CLIENT_PREALLOCATE", "false")
+    enable_compilation_cache()
+
+    from shapebody import plots, video
+
+    interface = video.find_opengl()
+    if sys.platform == "linux" and interface in ("egl", "osmesa"):
+        os.environ.setdefault("MUJOCO_GL", interface)
+    plots.use_style()
+
+    import jax
+    import mujoco
+
+    import shapebody
+
+    device = jax.devices()[0]
+    where = "the CPU" if device.platform == "cpu" else device.device_kind
+    print(
+        f"shapebody {shapebody.__version__}, Python {platform.python_version()}, "
+        f"jax {jax.__version__} on {where}, mujoco {mujoco.__version__}, "
+        f"pictures through {interface or 'drawing'}"
+    )

@@ -1,0 +1,53 @@
+import matplotlib.pyplot as plt
+import numpy as np
+import pytest
+
+from shapebody import plots
+
+
+@pytest.fixture
+def curve(tmp_path):
+    path = tmp_path / "curve.csv"
+    path.write_text("steps,return\n0,1.0\n10,3.0\n20,\n30,5.0\n")
+    return path
+
+
+def test_learning_curve(curve):
+    ax = plots.learning_curve(curve, "return", label="reduced")
+    (line,) = ax.lines
+    assert line.get_xdata().tolist() == [0, 10, 20, 30]
+    assert np.array_equal(line.get_ydata(), [1, 3, np.nan, 5], equal_nan=True)
+    plt.close("all")
+
+
+def test_smoothing_skips_missing_values(curve):
+    smooth, raw = plots.learning_curve(curve, "return", smooth=3).lines
+    assert smooth.get_ydata() == pytest.approx([2, 2, 4, 5])
+    assert len(raw.get_ydata()) == 4
+    plt.close("all")
+
+
+def test_missing_column_is_named(curve):
+    with pytest.raises(ValueError, match="no column 'reward'; it has steps, return"):
+        plots.learning_curve(curve, "reward")
+
+
+def test_paper_table():
+    table = plots.paper_table(
+        [("return", 42.6, (41.97, 0.312)), ("steps", None, 13_000_000)], note="ours (reduced)"
+    )
+    assert table.markdown().splitlines()[2:] == [
+        "| return | 42.60 | 41.97 ± 0.31 |",
+        "| steps | – | 13,000,000 |",
+    ]
+    assert "ours (reduced)" in table._repr_html_()
+    assert str(table).splitlines()[1].endswith("41.97 ± 0.31")
+
+
+def test_table_escapes_html():
+    assert "&lt;b&gt;" in plots.table([("<b>", 1)], ("a", "b"))._repr_html_()
+
+
+def test_ragged_rows_are_refused():
+    with pytest.raises(ValueError, match="3 cells"):
+        plots.table([(1, 2, 3)], ("a", "b"))
