@@ -38,9 +38,13 @@ _MODULE_OF = {
     "EvaluationConfig": "evaluation",
     "evaluate": "evaluation",
     "scale": "experiments",
+    "start_notebook": "runtime",
 }
 
-__all__ = sorted(_MODULE_OF)
+# Modules that notebooks use as such: shapebody.video.show_video(...).
+_MODULES = ("explorer", "plots", "video")
+
+__all__ = sorted([*_MODULE_OF, *_MODULES])
 
 
 def __getattr__(name):
@@ -48,6 +52,8 @@ def __getattr__(name):
         value = getattr(importlib.import_module(f"{__name__}.{_MODULE_OF[name]}"), name)
         globals()[name] = value
         return value
+    if name in _MODULES:
+        return importlib.import_module(f"{__name__}.{name}")
     import difflib
 
     close = difflib.get_close_matches(name, __all__, n=3)
