@@ -1,0 +1,323 @@
+"""The locomotion task: rewards, curriculum, commands, padding, failure, resume, two engines."""
+
+from dataclasses import replace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from shapebody.descriptions import Sizes
+from shapebody.locomotion import (
+    CONTROL_STEP,
+    TERMS,
+    Locomotion,
+    TaskConfig,
+    curriculum,
+    episode,
+    observations,
+    randomization,
+    rewards,
+)
+from shapebody.robots import load_robot
+
+QUIET = dict(
+    noise_joint_position=0.0,
+    noise_joint_velocity=0.0,
+    noise_angular_velocity=0.0,
+    noise_gravity=0.0,
+    push_probability=0.0,
+    command_change=0.0,
+)
+
+
+def wave(params, key, descriptions, observation):
+    """Open-loop actions that depend on nothing random."""
+    phase = jnp.arange(observation.joints.shape[-2])
+    time = observation.general[:, 6:7]
+    return 0.5 * jnp.sin(phase + 3 * time) * descriptions.joint_mask, ()
+
+
+@pytest.fixture(scope="module")
+def go2():
+    return load_robot("unitree_go2")
+
+
+@pytest.fixture(scope="module")
+def env(go2):
+    return Locomotion(go2, 6, config=TaskConfig(horizon=12), threads=1, engine="native")
+
+
+def moment_of(state, index=0):
+    """A reward `Moment` from environment `index` of a batch, with nothing going on."""
+    one = jax.tree.map(lambda x: np.asarray(x)[index], state)
+    return rewards.Moment(
+        readings=one.readings,
+        descriptions=one.descriptions,
+        command=one.command,
+        keep_nominal=one.keep_nominal,
+        actions=one.actions,
+        contact=one.contact,
+        air_time=one.air_time,
+        last_joint_velocity=one.readings.joint_velocity,
+        last_linear_velocity=one.readings.linear_velocity,
+        collisions=one.descriptions.nominal_collisions,
+    )
+
+
+def term(number, moment):
+    return float(TERMS[number - 1].function(moment))
+
+
+def test_reward_terms_by_hand(env):
+    m = moment_of(env.reset(jax.random.PRNGKey(0), designs=np.zeros(358), coefficient=0.0))
+    q = np.zeros(12)
+    q[0] = 0.2
+    tau = np.arange(12.0)
+    readings = replace(
+        m.readings,
+        linear_velocity=np.array([0.5, -0.1, 0.2]),
+        angular_velocity=np.array([0.1, 0.2, 0.3]),
+        joint_velocity=np.full(12, 2.0),
+        joint_torque=tau,
+        joint_position=m.descriptions.nominal + q,
+        foot_velocity=np.tile([0.3, 0.4, -0.5], (4, 1)),
+        imu_height=m.descriptions.imu_height + 0.1,
+        imu_quat=np.array([np.cos(0.15), np.sin(0.15), 0, 0]),
+    )
+    actions = np.stack([np.full(12, 1.0), np.full(12, 0.5), np.full(12, 0.25)])
+    m = m._replace(
+        readings=readings,
+        command=np.array([1.0, 0.0, 0.0]),
+        keep_nominal=np.ones(12),
+        actions=actions,
+        contact=np.array([1.0, 0.0, 0.0, 1.0]),
+        air_time=np.array([0.05, 0.3, 0.3, 5.0]),
+        last_joint_velocity=np.full(12, 1.0),
+        last_linear_velocity=np.zeros(3),
+        collisions=m.descriptions.nominal_collisions + 2,
+    )
+    wanted_air = 0.4 * float(np.mean(m.descriptions.dimensions))
+    expected = {
+        1: np.exp(-(0.25 + 0.01) / 0.25),
+        2: np.exp(-0.09 / 0.25),
+        3: 1.0,
+        4: 1.0,
+        5: -0.04,
+        6: -(0.25 + 0.01 + 0.04) / CONTROL_STEP**2,
+        7: -0.05,
+        8: -(0.3**2),
+        9: -0.04 / 12,
+        12: -4.0,
+        13: -((1.0 / CONTROL_STEP) ** 2),
+        14: -np.mean(tau**2),
+        15: -np.mean(2 * tau),
+        16: -0.25,
+        17: -((1 - 2 * 0.5 + 0.25) ** 2),
+        18: -2.0,
+        19: -0.01,
+        20: min(0.05 - wanted_air, 0) / 4,
+        22: -0.25 / 2,
+        23: -0.25,
+    }
+    for number, value in expected.items():
+        assert term(number, m) == pytest.approx(value, rel=1e-4), TERMS[number - 1].name
+    # Feet 1 and 2 are in the air; the pairs of a quadruped are front and hind feet.
+    pairs = np.argwhere(m.descriptions.foot_pairs > 0)
+    in_air = [m.contact[a] + m.contact[b] == 0 for a, b in pairs]
+    assert len(pairs) == 2 and term(21, m) == pytest.approx(-np.mean(in_air))
+    # Limits: soft position limits and 90 % of the velocity limit.
+    beyond = replace(
+        readings,
+        joint_position=m.descriptions.soft_limits[:, 1] + 0.1,
+        joint_velocity=m.descriptions.velocity_limits,
+    )
+    m = m._replace(readings=beyond)
+    assert term(10, m) == pytest.approx(-0.1, rel=1e-4)
+    assert term(11, m) == pytest.approx(-0.1 * np.mean(m.descriptions.velocity_limits), rel=1e-4)
+
+
+def test_standing_command_wants_no_air_time(env):
+    m = moment_of(env.reset(jax.random.PRNGKey(0), designs=np.zeros(358)))
+    m = m._replace(command=np.zeros(3), contact=np.ones(4), air_time=np.zeros(4))
+    assert term(20, m) == 0.0
+
+
+def test_combination_clips_and_scales_with_the_curriculum():
+    terms = np.zeros(23)
+    terms[:4] = 1.0
+    assert rewards.combine(terms, 0.0) == pytest.approx(0.02 * 3.0)
+    assert rewards.combine(terms, 1.0) == pytest.approx(0.02 * 3.1)
+    terms[4] = -100.0
+    # The penalty can take everything except the unclipped alive reward.
+    assert rewards.combine(terms, 1.0) == pytest.approx(0.02 * 0.05)
+    assert rewards.combine(terms, 0.0) == pytest.approx(0.02 * 3.0)
+
+
+def test_curriculum_accelerates_and_falls_back():
+    config = TaskConfig()
+    c, streak, history = 0.0, 0, []
+    for success in [True] * 14 + [False, False, True]:
+        c, streak = curriculum.update(config, c, jnp.asarray(streak), jnp.asarray(success))
+        history.append(round(float(c), 3))
+    assert history[:4] == [0.01, 0.03, 0.06, 0.1]
+    assert history[13] == 1.0 and history[14:] == [0.99, 0.97, 0.98]
+    assert bool(curriculum.is_success(config, 0.39, 500, 1.0))
+    assert not bool(curriculum.is_success(config, 0.41, 1000, 1.0))
+    assert not bool(curriculum.is_success(config, 0.1, 499, 1.0))
+
+
+def test_commands_follow_their_distribution():
+    config = TaskConfig()
+    keys = jax.random.split(jax.random.PRNGKey(0), 20_000)
+    commands = np.asarray(jax.vmap(lambda key: randomization.draw_command(config, key, 0.8))(keys))
+    standing = np.all(commands == 0, 1)
+    assert np.abs(commands).max() <= 0.8
+    nonzero = np.abs(commands[commands != 0])
+    assert nonzero.min() >= 0.08
+    # 4 % by choice and 0.1 % because all three components fell into the dead zone.
+    assert standing.mean() == pytest.approx(0.041, abs=0.005)
+    assert (commands[~standing] == 0).mean() == pytest.approx(0.105, abs=0.01)
+
+
+def test_delay_and_clipping_of_actions(env):
+    config = TaskConfig(action_delay=1, **QUIET)
+    state = env.reset(jax.random.PRNGKey(0), designs=np.zeros(358), coefficient=1.0)
+    one = jax.tree.map(lambda x: jnp.asarray(np.asarray(x)[0]), state)
+    d = one.descriptions
+    one, target, _, _ = episode.control(config, one, jnp.full(12, 20.0))
+    np.testing.assert_allclose(target, d.nominal)
+    one, target, _, _ = episode.control(config, one, jnp.zeros(12))
+    np.testing.assert_allclose(target, d.nominal + d.action_scale * 10.0, rtol=1e-6)
+    with pytest.raises(ValueError, match="action_delay is 2"):
+        TaskConfig(action_delay=2)
+
+
+def test_nominal_start_at_zero_coefficient(env, go2):
+    state = env.reset(jax.random.PRNGKey(1), designs=np.zeros(358), coefficient=0.0)
+    np.testing.assert_allclose(state.readings.joint_position[:, :12], [go2.nominal] * 6, atol=1e-6)
+    np.testing.assert_allclose(
+        np.asarray(state.readings.foot_position)[..., 2].min(1), 0, atol=1e-6
+    )
+    np.testing.assert_allclose(state.readings.imu_height, state.descriptions.imu_height, atol=1e-6)
+    _, observation = env._observe_jit(state)
+    assert np.abs(observation.joints[..., :3]).max() < 1e-6
+    np.testing.assert_allclose(observation.general[:, 10:], [[0, 0, -1]] * 6, atol=1e-6)
+    np.testing.assert_allclose(observation.privileged[:, 4], 0)
+
+
+def test_rollout_bookkeeping(env):
+    state = env.reset(jax.random.PRNGKey(2), coefficient=0.3, spread=True)
+    state, trajectory = env.rollout(wave, None, state, jax.random.PRNGKey(0), 20)
+    done = np.asarray(trajectory.terminated | trajectory.truncated)
+    assert done.any(0).all()
+    length = np.asarray(trajectory.episode_length)
+    assert np.array_equal(length[1:], np.where(done[:-1], 1, length[:-1] + 1))
+    # The description that `slot` selects is the one whose nominal action scale the step used.
+    number = np.cumsum(done, 0) - done
+    for n in range(6):
+        first, last = number[:, n] == 0, number[:, n] == done[:, n].sum()
+        assert np.array_equal(trajectory.valid[:, n] > 0, first | last)
+        assert np.array_equal(trajectory.slot[:, n] > 0, last)
+    for leaf in jax.tree.leaves(trajectory.observation):
+        assert np.isfinite(leaf).all() and np.abs(leaf).max() <= 10
+    np.testing.assert_array_equal(trajectory.descriptions.joints[1], state.descriptions.joints)
+
+
+def test_padding_and_company_change_nothing(go2):
+    config = TaskConfig(**QUIET)
+    golem = load_robot("golem")
+    keys = jax.random.split(jax.random.PRNGKey(3), 4)
+    alone = Locomotion(go2, 2, config=config, threads=1, engine="native")
+    mixed = Locomotion([go2, golem], 4, config=config, threads=1, engine="native")
+    start = go2.design_dim
+    designs = np.zeros((4, golem.design_dim), np.float32)
+    designs[:, :start] = np.random.default_rng(0).uniform(-0.5, 0.5, (4, start))
+    a = alone.reset(None, designs=designs[:2, :start], keys=keys[:2])
+    b = mixed.reset(None, designs=designs, keys=keys)
+    assert mixed.sizes == Sizes.of(go2, golem)
+    for _ in range(2):
+        a, short = alone.rollout(wave, None, a, jax.random.PRNGKey(0), 4)
+        b, padded = mixed.rollout(wave, None, b, jax.random.PRNGKey(0), 4)
+        np.testing.assert_allclose(padded.reward[:, :2], short.reward, rtol=1e-4, atol=1e-6)
+        np.testing.assert_allclose(
+            padded.observation.joints[:, :2, :12], short.observation.joints, rtol=1e-3, atol=1e-5
+        )
+    assert np.all(np.asarray(padded.observation.joints)[:, :2, 12:] == 0)
+    with pytest.raises(ValueError, match="2 robots need"):
+        Locomotion([go2, golem], 1)
+    with pytest.raises(ValueError, match="engine is 'bullet'"):
+        Locomotion(go2, 1, engine="bullet")
+
+
+def test_a_broken_simulation_ends_alone(go2):
+    config = TaskConfig(**QUIET)
+    env = Locomotion(go2, 3, config=config, threads=1, engine="native", auto_reset=False)
+    keys = jax.random.split(jax.random.PRNGKey(4), 3)
+
+    def run(breaks):
+        state = env.reset(None, designs=np.zeros(358), keys=keys)
+        records = []
+        for t in range(3):
+            if breaks and t == 1:
+                env.groups[0].physics.qpos[1] = np.nan
+            state, record, _ = env.step(wave, None, state, jax.random.PRNGKey(t))
+            records.append(record)
+        return jax.tree.map(lambda *x: np.stack(x), *records)
+
+    good, bad = run(False), run(True)
+    assert not bad.finite[1, 1] and bad.terminated[1, 1] and bad.reward[1, 1] == 0
+    assert np.isfinite(bad.reward).all() and np.isfinite(bad.observation.joints).all()
+    for i in (0, 2):
+        np.testing.assert_array_equal(bad.reward[:, i], good.reward[:, i])
+
+
+def test_restore_continues_exactly(go2):
+    def make():
+        return Locomotion(go2, 4, config=TaskConfig(horizon=9), threads=1, engine="native")
+
+    env = make()
+    state = env.reset(jax.random.PRNGKey(5), coefficient=0.5, spread=True)
+    state, _ = env.rollout(wave, None, state, jax.random.PRNGKey(0), 5)
+    saved = env.physics_arrays()
+    _, expected = env.rollout(wave, None, state, jax.random.PRNGKey(1), 8)
+    other = make()
+    other.reset(jax.random.PRNGKey(6))
+    other.restore(state, saved)
+    _, got = other.rollout(wave, None, state, jax.random.PRNGKey(1), 8)
+    for x, y in zip(jax.tree.leaves(expected), jax.tree.leaves(got), strict=True):
+        np.testing.assert_array_equal(x, y)
+
+
+def test_box_feet_touch_with_their_lowest_corner():
+    robot = load_robot("mit_humanoid")
+    env = Locomotion(robot, 1, threads=1, engine="native")
+    state = env.reset(jax.random.PRNGKey(0), designs=np.zeros(514), coefficient=0.0)
+    one = jax.tree.map(lambda x: np.asarray(x)[0], state)
+    # Foot centres are at floor height, so the soles are below it.
+    assert np.array_equal(observations.foot_contact(one.readings, one.descriptions), [1, 1])
+    lowest = np.abs(one.readings.foot_down * one.descriptions.foot_size).sum(-1)
+    for height, touching in [(lowest * 0.99, 1), (lowest * 1.01, 0)]:
+        position = one.readings.foot_position.copy()
+        position[:, 2] = height
+        readings = replace(one.readings, foot_position=position)
+        assert np.all(observations.foot_contact(readings, one.descriptions) == touching)
+
+
+@pytest.mark.slow
+def test_engines_agree_on_the_task(go2):
+    """The same designs and actions on both engines: rewards and observations stay close."""
+    config = TaskConfig(**QUIET)
+    keys = jax.random.split(jax.random.PRNGKey(7), 4)
+    designs = np.random.default_rng(1).uniform(-0.3, 0.3, (4, 358)).astype(np.float32)
+    trajectories = []
+    for engine in ("native", "mjx"):
+        options = dict(solver_iterations=4, line_search=8)
+        env = Locomotion(go2, 4, engine, config, physics_options=options)
+        state = env.reset(jax.random.PRNGKey(0), designs=designs, keys=keys)
+        trajectories.append(env.rollout(wave, None, state, jax.random.PRNGKey(0), 12)[1])
+    c, mjx = trajectories
+    assert np.array_equal(c.terminated, mjx.terminated)
+    np.testing.assert_allclose(c.observation.joints, mjx.observation.joints, atol=2e-3)
+    np.testing.assert_allclose(c.observation.feet, mjx.observation.feet, atol=0.05)
+    np.testing.assert_allclose(c.reward, mjx.reward, atol=2e-3)

@@ -1,0 +1,147 @@
+"""PPO: advantages, one update, exact resume, policy evaluation."""
+
+from dataclasses import replace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from shapebody import ppo
+from shapebody.checkpoints import load_agent
+from shapebody.networks import CriticConfig
+
+
+def test_advantages_against_a_plain_loop():
+    rng = np.random.default_rng(0)
+    n, t, discount, lam = 5, 9, 0.99, 0.7
+    reward, value = rng.normal(size=(2, n, t)).astype(np.float32)
+    last = rng.normal(size=n).astype(np.float32)
+    terminated = rng.random((n, t)) < 0.2
+    truncated = (rng.random((n, t)) < 0.2) & ~terminated
+    got = ppo.advantages(reward, value, last, terminated, truncated, discount, lam)
+    for i in range(n):
+        advantage = 0.0
+        for k in reversed(range(t)):
+            following = last[i] if k == t - 1 else value[i, k + 1]
+            if truncated[i, k]:
+                following = value[i, k]
+            if terminated[i, k]:
+                following = 0.0
+            if truncated[i, k] or terminated[i, k]:
+                advantage = 0.0
+            advantage = (
+                reward[i, k] + discount * following - value[i, k] + (discount * lam * advantage)
+            )
+            assert got[i, k] == pytest.approx(advantage, rel=1e-4, abs=1e-5)
+
+
+def test_configurations():
+    full = ppo.TrainConfig.full("unitree_go2")
+    assert (full.num_envs, full.rollout_length, full.minibatch_size) == (4096, 64, 16384)
+    assert full.learning_rate == (1.5e-3, 3e-4) and full.epochs == 10
+    assert (full.discount, full.gae_lambda, full.clip_range) == (0.99, 0.7, 0.1)
+    assert (full.entropy_coefficient, full.max_gradient_norm) == (0.005, 3.0)
+    assert full.kl_threshold == 0.5 and full.total_steps == 10**9
+    with pytest.raises(ValueError, match="minibatch_size is 1000"):
+        replace(full, minibatch_size=1000)
+    with pytest.raises(ValueError, match="scale is 'huge'"):
+        ppo.TrainConfig.at_scale("huge", "unitree_go2")
+
+
+@pytest.fixture(scope="module")
+def config():
+    return ppo.TrainConfig.smoke("unitree_go2", total_steps=128 * 5)
+
+
+@pytest.fixture(scope="module")
+def straight(config, tmp_path_factory):
+    folder = tmp_path_factory.mktemp("straight")
+    trainer = ppo.Trainer(config, folder)
+    trainer.start()
+    trainer.run(max_steps=128 * 4, progress=False)
+    return folder, trainer
+
+
+def leaves(trainer):
+    return [np.asarray(x) for x in jax.tree.leaves(trainer.learner)]
+
+
+def test_resume_is_exact(config, straight, tmp_path):
+    """Stopped twice, the run ends with the very weights of the uninterrupted one."""
+    for steps in (128, 128 * 3, 128 * 4):
+        trainer = ppo.Trainer(config, tmp_path)
+        assert trainer.start() == (steps > 128)
+        trainer.run(max_steps=steps, progress=False)
+        assert trainer.steps == steps
+    for a, b in zip(leaves(straight[1]), leaves(trainer), strict=True):
+        np.testing.assert_array_equal(a, b)
+
+
+def test_a_crash_while_saving_loses_nothing(config, straight, tmp_path, monkeypatch):
+    trainer = ppo.Trainer(config, tmp_path)
+    trainer.start()
+    trainer.run(max_steps=128, progress=False)
+    before = (tmp_path / "training.safetensors").read_bytes()
+
+    def fail(*args, **kwargs):
+        raise OSError("disk full")
+
+    monkeypatch.setattr("os.replace", fail)
+    with pytest.raises(OSError, match="disk full"):
+        trainer.run(max_steps=256, progress=False)
+    monkeypatch.undo()
+    assert (tmp_path / "training.safetensors").read_bytes() == before
+    again = ppo.Trainer(config, tmp_path)
+    assert again.start() and again.steps == 128
+
+
+def test_update_follows_the_advantage(straight):
+    """Actions with positive advantage become more likely, and the critic fits its targets."""
+    _, trainer = straight
+    env, config = trainer.env, replace(trainer.config, epochs=8, entropy_coefficient=0.0)
+    update, start = ppo.make_update(config, trainer.policy, trainer.critic)
+    learner = start(trainer.learner.policy, trainer.learner.critic)
+    state = env.reset(jax.random.PRNGKey(1), coefficient=0.0)
+    state, trajectory = env.rollout(trainer.act, learner.policy, state, jax.random.PRNGKey(2), 8)
+    # Reward actions of the first joint by their sign.
+    sign = np.sign(np.asarray(trajectory.action)[..., 0])
+    trajectory = replace(trajectory, reward=sign.astype(np.float32))
+    after, metrics = update(learner, trajectory, jax.random.PRNGKey(3))
+
+    def mean_action(policy):
+        mean, _ = trainer.policy.apply(policy, state.descriptions, trajectory.last_observation)
+        return float(jnp.mean(mean[:, 0]))
+
+    assert mean_action(after.policy) > mean_action(learner.policy)
+    assert metrics["updates"] > 0 and 0 < metrics["kl"] < 1
+    later = after
+    for i in range(5):
+        later, more = update(later, trajectory, jax.random.PRNGKey(4 + i))
+    assert more["value_loss"] < metrics["value_loss"]
+
+
+def test_curve_has_a_row_per_interval(config, tmp_path, monkeypatch):
+    monkeypatch.setattr(ppo, "CURVE_INTERVAL", 2)
+    for steps in (128 * 2, 128 * 5):
+        trainer = ppo.Trainer(config, tmp_path)
+        trainer.start()
+        trainer.run(max_steps=steps, progress=False)
+    rows = (tmp_path / "curve.csv").read_text().splitlines()
+    assert rows[0].split(",") == ppo.CURVE
+    assert [int(row.split(",")[0]) for row in rows[1:]] == [256, 512]
+
+
+def test_train_and_policy_evaluation(config, tmp_path):
+    agent = ppo.train(config, tmp_path / "a", progress=False, max_steps=128)
+    loaded = load_agent(tmp_path / "a")
+    assert loaded.metadata["steps"] == 128 and loaded.robots == ("unitree_go2",)
+    assert agent.states.joints.shape == (64, 12, 4)
+    small = CriticConfig.reduced(
+        joint_key_widths=(8, 8), foot_key_widths=(8, 8), head_widths=(8,), heads=3
+    )
+    sharper = ppo.train_critic(loaded, small, steps=256, folder=tmp_path / "b", progress=False)
+    for a, b in zip(jax.tree.leaves(agent.policy), jax.tree.leaves(sharper.policy), strict=True):
+        np.testing.assert_array_equal(a, b)
+    assert sharper.critic_config.heads == 3
+    assert np.all(np.asarray(sharper.states.privileged)[:, 4] == 1.0)
