@@ -172,6 +172,10 @@ class NativePhysics:
             sensordata[failed] = self._home_sensordata
         return Readings(self.qpos, self.qvel, sensordata, finite)
 
+    def get_model(self, env: int) -> mujoco.MjModel:
+        """A copy of the model that simulation `env` runs, with its design."""
+        return self._batch.get_model(int(self._ids([env])[0]))
+
     def state(self) -> dict[str, np.ndarray]:
         """Copies of all arrays from which `restore` resumes exactly.
 
