@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
-from .design import Embodiment, quaternion_product, soft_limits
+from .design import Embodiment, soft_limits
 from .robots import Robot
 
 JOINT_DESCRIPTION = 30
@@ -90,117 +90,176 @@ class Descriptions:
     total_mass: jax.Array  # [] kg
 
 
-def rotation_matrix(quaternion):
-    """Rotation matrices [..., 3, 3] of unit quaternions [..., 4], scalar part first."""
-    w, x, y, z = (quaternion[..., k] for k in range(4))
+# Inside this module vectors are [3, n], quaternions [4, n] and rotations [3, 3, n]: with components
+# first, everything is a sum of products of long rows, which XLA turns into fast loops.
+
+
+def _matrix(q):
+    """Rotations [3, 3, n] of unit quaternions [4, n]."""
+    w, x, y, z = q
     rows = [
         [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
         [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
         [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
     ]
-    return jnp.stack([jnp.stack(row, axis=-1) for row in rows], axis=-2)
+    return jnp.stack([jnp.stack(row) for row in rows])
 
 
-def rotate(rotation, vector):
-    """Rotated vectors [..., 3] = rotation [..., 3, 3] · vector [..., 3]."""
-    return jnp.sum(rotation * vector[..., None, :], axis=-1)
+def _rotate(rotation, vector):
+    """Rotated vectors [3, n] = rotation [3, 3, n] · vector [3, n]."""
+    return rotation[:, 0] * vector[0] + rotation[:, 1] * vector[1] + rotation[:, 2] * vector[2]
 
 
-def compose(first, second):
-    """Matrix products [..., 3, 3], written as sums: much faster than a batched dot on a CPU."""
-    return jnp.sum(first[..., :, :, None] * second[..., None, :, :], axis=-2)
+def _compose(first, second):
+    """Rotation products [3, 3, n]."""
+    return jnp.stack([_rotate(first, second[:, column]) for column in range(3)], axis=1)
 
 
-def _levels(robot: Robot) -> list[np.ndarray]:
-    """Body ids by depth in the tree: [world], [trunk], ..."""
-    parents = robot.model.body_parentid
-    depth = np.zeros(len(parents), int)
-    for body in range(1, len(parents)):
-        depth[body] = depth[parents[body]] + 1
-    return [np.flatnonzero(depth == level) for level in range(depth.max() + 1)]
+def _multiply(p, q):
+    """Quaternion products [4, n]."""
+    return jnp.stack(
+        [
+            p[0] * q[0] - p[1] * q[1] - p[2] * q[2] - p[3] * q[3],
+            p[0] * q[1] + p[1] * q[0] + p[2] * q[3] - p[3] * q[2],
+            p[0] * q[2] - p[1] * q[3] + p[2] * q[0] + p[3] * q[1],
+            p[0] * q[3] + p[1] * q[2] - p[2] * q[1] + p[3] * q[0],
+        ]
+    )
+
+
+def _take(rows, index):
+    """Columns `index` (constant) of rows [..., n]."""
+    index = np.asarray(index)
+    return rows if np.array_equal(index, np.arange(rows.shape[-1])) else rows[..., index]
+
+
+def _plan(robot: Robot):
+    """The tree below the trunk as levels of nodes: (body, joint, parent, last), int [L, W] each.
+
+    A node is one joint of a body, or a body without joint; its offset is that of `body`. World
+    (body 0, no offset) and free joint (joint 0, never turned) stand for "none" and for padding.
+    `parent` counts within the level above. Last, for bodies from 2 on and for hinge joints in id
+    order, the flat index of the node that holds their frame.
+    """
+    model = robot.model
+    nodes, levels, of_body, of_joint = {1: (0, 0)}, [], {}, {}
+    for body in range(2, model.nbody):
+        first, number = model.body_jntadr[body], model.body_jntnum[body]
+        joints = list(range(first, first + number)) or [0]
+        depth, place = nodes[model.body_parentid[body]]
+        for joint in joints:
+            while len(levels) <= depth:
+                levels.append([])
+            offset = body if joint == joints[0] else 0
+            levels[depth].append((offset, joint, place))
+            depth, place = depth + 1, len(levels[depth]) - 1
+            of_joint[joint] = (depth - 1, place)
+        nodes[body] = (depth, place)
+        of_body[body] = (depth - 1, place)
+    width = max(len(level) for level in levels)
+    table = np.zeros((3, len(levels), width), int)
+    for depth, level in enumerate(levels):
+        table[:, depth, : len(level)] = np.array(level).T
+
+    def flat(places):
+        return np.array([depth * width + place for depth, place in places], int)
+
+    bodies = flat(of_body[body] for body in range(2, model.nbody))
+    return *table, bodies, flat(of_joint[joint] for joint in range(1, model.njnt))
+
+
+def _tree(robot: Robot):
+    """Forward kinematics of the bodies of one design, as a scan over the levels of the tree.
+
+    Returns a function (embodiment, qpos) -> body positions [3, nbody], body rotations
+    [3, 3, nbody], joint anchors [3, nj], joint axes [3, nj].
+    """
+    model = robot.model
+    body, joint, parent, of_body, of_joint = _plan(robot)
+    address = model.jnt_qposadr[joint]
+    turned = (0.5 * (joint > 0)).astype(np.float32)
+    qpos0 = np.asarray(model.qpos0, np.float32)[address]
+
+    def step(carry, level):
+        quat, pos = carry
+        parent, offset, offset_quat, local, axis, half = level
+        quat, pos = quat[:, parent], pos[:, parent]
+        pos = pos + _rotate(_matrix(quat), offset)
+        quat = _multiply(quat, offset_quat)
+        anchor = pos + _rotate(_matrix(quat), local)
+        quat = _multiply(quat, jnp.concatenate([jnp.cos(half)[None], jnp.sin(half) * axis]))
+        rot = _matrix(quat)
+        pos = anchor - _rotate(rot, local)
+        return (quat, pos), (pos, rot, anchor, _rotate(rot, axis))
+
+    def forward(e: Embodiment, qpos):
+        def stacked(rows, index):
+            return jnp.moveaxis(rows[index], -1, 1)
+
+        quat = qpos[3:7, None]
+        quat = quat / jnp.sqrt(jnp.sum(quat**2))
+        pos = qpos[:3, None]
+        levels = (
+            parent,
+            stacked(e.body_pos, body),
+            stacked(e.body_quat, body),
+            stacked(e.jnt_pos, joint),
+            stacked(e.jnt_axis, joint),
+            turned * (qpos[address] - qpos0),
+        )
+        width = parent.shape[1]
+        start = (jnp.broadcast_to(quat, (4, width)), jnp.broadcast_to(pos, (3, width)))
+        _, outputs = jax.lax.scan(step, start, levels)
+        below, rotations, anchors, axes = (
+            jnp.moveaxis(x, 0, -2).reshape(*x.shape[1:-1], -1) for x in outputs
+        )
+        world, identity = np.zeros((3, 1), np.float32), np.eye(3, dtype=np.float32)[..., None]
+        return (
+            jnp.concatenate([world, pos, below[:, of_body]], axis=-1),
+            jnp.concatenate([identity, _matrix(quat), rotations[..., of_body]], axis=-1),
+            anchors[:, of_joint],
+            axes[:, of_joint],
+        )
+
+    return forward
 
 
 def kinematics(robot: Robot) -> Callable[[Embodiment, jax.Array], Frames]:
     """Forward kinematics of one design: a function (embodiment, qpos [nq]) -> `Frames`.
 
-    Agrees with MuJoCo's `mj_kinematics`. One step per level of the tree, so compile time and run
-    time depend on the depth of the robot and not on its number of bodies.
+    Agrees with MuJoCo's `mj_kinematics` (which also normalizes the free joint's quaternion).
     """
     model = robot.model
-    levels = _levels(robot)
-    order = np.concatenate(levels)
-    place = np.argsort(order)
-    hinges = [
-        [j for j in range(adr, adr + num) if j > 0] if num else []
-        for adr, num in zip(model.body_jntadr, model.body_jntnum, strict=True)
-    ]
-    joint_order = np.array(
-        [
-            hinges[body][slot]
-            for level in levels
-            for slot in range(max(len(hinges[body]) for body in level))
-            for body in level
-            if len(hinges[body]) > slot
-        ],
-        int,
-    )
-    joint_place = np.argsort(joint_order)
-    geom_rot = rotation_matrix(jnp.asarray(model.geom_quat, jnp.float32))
-    site_rot = rotation_matrix(jnp.asarray(model.site_quat, jnp.float32))
-    geom_rot, site_rot = np.asarray(geom_rot), np.asarray(site_rot)
-    qpos0 = np.asarray(model.qpos0, np.float32)
+    tree = _tree(robot)
+    geom_rot = _constant_rotations(model.geom_quat)
+    site_rot = _constant_rotations(model.site_quat)
 
     def frames(embodiment: Embodiment, qpos) -> Frames:
         e = embodiment
-        quat = jnp.concatenate([e.body_quat[:1], qpos[None, 3:7]])
-        quat = quat / jnp.sqrt(jnp.sum(quat**2, axis=-1, keepdims=True))
-        pos = jnp.concatenate([e.body_pos[:1], qpos[None, 0:3]])
-        rot = rotation_matrix(quat)
-        all_pos, all_rot, anchors, axes = [pos], [rot], [], []
-        quat, pos, rot = quat[1:], pos[1:], rot[1:]
-        for above, level in zip(levels[1:-1], levels[2:], strict=True):
-            parent = np.searchsorted(above, model.body_parentid[level])
-            if not np.array_equal(parent, np.arange(len(above))):
-                quat, pos, rot = quat[parent], pos[parent], rot[parent]
-            pos = pos + rotate(rot, e.body_pos[level])
-            quat = quaternion_product(quat, e.body_quat[level])
-            slots = max(len(hinges[body]) for body in level)
-            for slot in range(slots):
-                # Bodies without this joint turn by zero about the free joint's (unused) axis.
-                joint = np.array([(hinges[b] + [0] * slots)[slot] for b in level])
-                address = model.jnt_qposadr[joint]
-                half = 0.5 * (qpos[address] - qpos0[address]) * (joint > 0).astype(np.float32)
-                axis = e.jnt_axis[joint]
-                turn = jnp.concatenate(
-                    [jnp.cos(half)[:, None], jnp.sin(half)[:, None] * axis], axis=-1
-                )
-                anchor = pos + rotate(rotation_matrix(quat), e.jnt_pos[joint])
-                quat = quaternion_product(quat, turn)
-                rot = rotation_matrix(quat)
-                pos = anchor - rotate(rot, e.jnt_pos[joint])
-                real = np.flatnonzero(joint > 0)
-                anchors.append(anchor[real])
-                axes.append(rotate(rot, axis)[real])
-            if slots == 0:
-                rot = rotation_matrix(quat)
-            all_pos.append(pos)
-            all_rot.append(rot)
-        body_pos = jnp.concatenate(all_pos)[place]
-        body_rot = jnp.concatenate(all_rot)[place]
-        geom, site = model.geom_bodyid, model.site_bodyid
+        pos, rot, anchor, axis = tree(e, qpos)
+        geom_body = _take(rot, model.geom_bodyid)
+        site_body = _take(rot, model.site_bodyid)
         return Frames(
-            body_pos=body_pos,
-            body_rot=body_rot,
-            geom_pos=body_pos[geom] + rotate(body_rot[geom], e.geom_pos),
-            geom_rot=compose(body_rot[geom], geom_rot),
-            site_pos=body_pos[site] + rotate(body_rot[site], e.site_pos),
-            site_rot=compose(body_rot[site], site_rot),
-            joint_anchor=jnp.concatenate(anchors)[joint_place],
-            joint_axis=jnp.concatenate(axes)[joint_place],
-            com=body_pos + rotate(body_rot, e.body_ipos),
+            body_pos=pos.T,
+            body_rot=jnp.moveaxis(rot, -1, 0),
+            geom_pos=(_take(pos, model.geom_bodyid) + _rotate(geom_body, e.geom_pos.T)).T,
+            geom_rot=jnp.moveaxis(_compose(geom_body, geom_rot), -1, 0),
+            site_pos=(_take(pos, model.site_bodyid) + _rotate(site_body, e.site_pos.T)).T,
+            site_rot=jnp.moveaxis(_compose(site_body, site_rot), -1, 0),
+            joint_anchor=anchor.T,
+            joint_axis=axis.T,
+            com=(pos + _rotate(rot, e.body_ipos.T)).T,
         )
 
     return frames
+
+
+def _constant_rotations(quaternions):
+    """Rotations [3, 3, n] of constant quaternions [n, 4], as NumPy."""
+    rotations = np.zeros((len(quaternions), 9))
+    for rotation, quaternion in zip(rotations, quaternions, strict=True):
+        mujoco.mju_quat2Mat(rotation, quaternion)
+    return np.ascontiguousarray(np.moveaxis(rotations.reshape(-1, 3, 3), 0, -1), np.float32)
 
 
 def symmetric_feet(robot: Robot) -> np.ndarray:
@@ -239,15 +298,16 @@ def describe(robot: Robot, sizes: Sizes | None = None) -> Callable[[Embodiment],
                 f"{getattr(own, name)} for robot {robot.name!r}; use Sizes.of with all robots"
             )
     model = robot.model
-    forward = kinematics(robot)
+    forward = _tree(robot)
     joints = robot.joints[robot.actuated]
     dofs = robot.qvel_index
     bodies = model.jnt_bodyid[joints]
-    described = np.concatenate([bodies, robot.foot_bodies, [robot.trunk]])
     children = np.bincount(model.body_parentid[1:], minlength=model.nbody)[bodies]
+    children = (children[None] / 2.5 - 1).astype(np.float32)
     boxed = np.concatenate([robot.spheres, robot.feet])
     home = np.asarray(robot.home, np.float32)
-    home_rot = np.asarray(rotation_matrix(jnp.asarray(home[3:7] / np.linalg.norm(home[3:7]))))
+    home_quat = robot.home[3:7] / np.linalg.norm(robot.home[3:7])
+    up = _constant_rotations(home_quat[None])[2, :, 0]  # vertical axis in the trunk frame
     origin = home.copy()
     origin[:7] = 0, 0, 0, 1, 0, 0, 0
     # One-hot rows put nominal positions into qpos without a scatter.
@@ -268,108 +328,97 @@ def describe(robot: Robot, sizes: Sizes | None = None) -> Callable[[Embodiment],
     keep_nominal = np.asarray(padded(robot.keep_nominal, sizes.joints))
     foot_is_box = np.asarray(padded(robot.foot_types, sizes.feet))
     foot_pairs = np.asarray(padded(symmetric_feet(robot), sizes.feet, axes=2))
-    foot_type = 2 * robot.foot_types[:, None] - 1.0
+    foot_type = (2 * robot.foot_types[None] - 1).astype(np.float32)
+    boxed_rot = _constant_rotations(model.geom_quat[boxed])
 
     def single(embodiment: Embodiment) -> Descriptions:
         e = embodiment
         # With the trunk at the origin, world coordinates are trunk coordinates.
         qpos = passive + jnp.sum(place * e.nominal[:, None], axis=0)
-        at = forward(e, qpos)
+        pos, rot, anchor, axis = forward(e, qpos)
+        com = pos + _rotate(rot, e.body_ipos.T)
 
         # A geom reaches as far as its rotated size triple, of which a sphere has only one entry.
         # This is not its true extent, but what descriptions are made of.
-        centers = at.geom_pos[boxed]
-        reach = jnp.abs(rotate(at.geom_rot[boxed], e.geom_size[boxed]))
-        points = jnp.concatenate([at.joint_anchor[robot.actuated], at.com[1:]])
-        low = jnp.minimum(jnp.min(centers - reach, axis=0), jnp.min(points, axis=0))
-        high = jnp.maximum(jnp.max(centers + reach, axis=0), jnp.max(points, axis=0))
-        dimensions = high - low
+        box_rot = _take(rot, model.geom_bodyid[boxed])
+        center = _take(pos, model.geom_bodyid[boxed]) + _rotate(box_rot, _take(e.geom_pos.T, boxed))
+        size = _take(e.geom_size.T, boxed)
+        reach = jnp.abs(_rotate(box_rot, _rotate(boxed_rot, size)))
+        anchor, axis = _take(anchor, robot.actuated), _take(axis, robot.actuated)
+        points = jnp.concatenate([anchor, com[:, 1:]], axis=-1)
+        low = jnp.min(jnp.concatenate([center - reach, points], axis=-1), axis=-1, keepdims=True)
+        high = jnp.max(jnp.concatenate([center + reach, points], axis=-1), axis=-1, keepdims=True)
+        # Without a barrier XLA computes the whole tree again for every number that uses the box.
+        low, high = jax.lax.optimization_barrier((low, high))
+        dimensions = (high - low)[:, 0]
 
         def relative(point):
-            return 2 * (point - low) / dimensions - 1
+            return 2 * (point - low) / (high - low) - 1
 
         # Principal moments are rotated like a vector, not like a tensor.
-        inertia_rot = compose(at.body_rot[described], rotation_matrix(e.body_iquat[described]))
-        attributes = jnp.concatenate(
-            [
-                e.body_mass[described][:, None] / 200 - 1,
-                relative(at.com[described]),
-                rotate(inertia_rot, e.body_inertia[described]) / 13 - 1,
-            ],
-            axis=-1,
-        )
-        joint_bodies = attributes[:num_joints]
-        foot_bodies = attributes[num_joints : num_joints + num_feet]
-        trunk = attributes[-1]
+        moments = _rotate(rot, _rotate(_matrix(e.body_iquat.T), e.body_inertia.T)) / 13 - 1
+        attributes = jnp.concatenate([e.body_mass[None] / 200 - 1, relative(com), moments])
+        trunk = attributes[:, robot.trunk]
 
         total_mass = jnp.sum(e.body_mass[1:])
         gains = jnp.stack([e.p_gain / 85 - 1, e.d_gain / 1 - 1, e.action_scale / 0.75 - 1])
         whole = jnp.concatenate([gains, (total_mass / 450 - 1)[None], dimensions / 1.5 - 1])
 
-        columns = jnp.stack(
-            [
-                children / np.float32(2.5) - 1,
-                e.nominal / 6.5,
-                e.actuator_forcerange[:, 1] / 800 - 1,
-                e.velocity_limits / 90 - 1,
-                e.dof_damping[dofs] / 0.1 - 1,
-                e.dof_armature[dofs] / 1.35 - 1,
-                e.jnt_stiffness[joints] / 0.1 - 1,
-                e.dof_frictionloss[dofs] / 18.5 - 1,
-            ],
-            axis=-1,
-        )
-        joint_range = e.jnt_range[joints]
+        joint_range = _take(e.jnt_range.T, joints)
         joint_rows = jnp.concatenate(
             [
-                relative(at.joint_anchor[robot.actuated]),
-                at.joint_axis[robot.actuated],
-                joint_bodies,
-                columns,
+                relative(anchor),
+                axis,
+                _take(attributes, bodies),
+                children,
+                e.nominal[None] / 6.5,
+                e.actuator_forcerange[None, :, 1] / 800 - 1,
+                e.velocity_limits[None] / 90 - 1,
+                _take(e.dof_damping, dofs)[None] / 0.1 - 1,
+                _take(e.dof_armature, dofs)[None] / 1.35 - 1,
+                _take(e.jnt_stiffness, joints)[None] / 0.1 - 1,
+                _take(e.dof_frictionloss, dofs)[None] / 18.5 - 1,
                 joint_range / 6.5,
-                jnp.broadcast_to(whole, (num_joints, 7)),
-            ],
-            axis=-1,
+                jnp.broadcast_to(whole[:, None], (7, num_joints)),
+            ]
         )
-        feet = at.geom_pos[robot.feet]
-        foot_size = e.geom_size[robot.feet]
+        spheres, feet = center[:, : robot.num_spheres], center[:, robot.num_spheres :]
+        foot_size = size[:, robot.num_spheres :]
         foot_rows = jnp.concatenate(
             [
                 relative(feet),
-                foot_bodies,
+                _take(attributes, robot.foot_bodies),
                 foot_size / FOOT_SIZE_SCALE - 1,
-                jnp.asarray(foot_type, jnp.float32),
-                jnp.broadcast_to(whole, (num_feet, 7)),
-            ],
-            axis=-1,
+                foot_type,
+                jnp.broadcast_to(whole[:, None], (7, num_feet)),
+            ]
         )
 
-        home_height = -jnp.min(jnp.sum(feet * home_rot[2], axis=-1))
-        imu = at.site_pos[robot.imu_site]
-        radius = e.geom_size[robot.spheres, 0]
-        spheres = at.geom_pos[robot.spheres]
-        distance2 = jnp.sum((spheres[:, None] - spheres[None]) ** 2, axis=-1)
+        home_height = -jnp.min(up @ feet)
+        imu = pos[:, robot.trunk] + rot[..., robot.trunk] @ e.site_pos[robot.imu_site]
+        radius = size[0, : robot.num_spheres]
+        distance2 = sum((row[:, None] - row[None]) ** 2 for row in spheres)
         touching = distance2 < (radius[:, None] + radius[None]) ** 2
         collisions = jnp.sum(jnp.where(above_diagonal, touching, False).astype(jnp.float32))
 
         return Descriptions(
-            joints=padded(joint_rows, sizes.joints),
+            joints=padded(joint_rows.T, sizes.joints),
             joint_mask=jnp.asarray(joint_mask),
-            feet=padded(foot_rows, sizes.feet),
+            feet=padded(foot_rows.T, sizes.feet),
             foot_mask=jnp.asarray(foot_mask),
             static=jnp.concatenate([whole, trunk]),
             nominal=padded(e.nominal, sizes.joints),
             action_scale=e.action_scale,
             velocity_limits=padded(e.velocity_limits, sizes.joints),
-            soft_limits=padded(soft_limits(joint_range), sizes.joints),
+            soft_limits=padded(soft_limits(joint_range.T), sizes.joints),
             keep_nominal=jnp.asarray(keep_nominal),
-            foot_size=padded(foot_size, sizes.feet),
+            foot_size=padded(foot_size.T, sizes.feet),
             foot_is_box=jnp.asarray(foot_is_box),
             foot_pairs=jnp.asarray(foot_pairs),
             sphere_radius=padded(radius, sizes.spheres),
             sphere_mask=jnp.asarray(sphere_mask),
             home_height=home_height,
-            imu_height=home_height + jnp.sum(imu * home_rot[2]),
+            imu_height=home_height + up @ imu,
             nominal_collisions=collisions,
             dimensions=dimensions,
             total_mass=total_mass,

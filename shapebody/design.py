@@ -399,7 +399,7 @@ def _embodiment(constants: dict, slices: dict[str, slice], f) -> Embodiment:
     x = {block.key: block.range * entries[block.key] for block in BLOCKS}
 
     s = 1 + x["size"][0]
-    a = jnp.mean(s)
+    a = 1 + jnp.mean(x["size"])  # the mean of s, exactly 1 at the reference
 
     def with_world(name, values):
         return jnp.concatenate([c[name][:1], values])
@@ -474,6 +474,10 @@ def _embodiment(constants: dict, slices: dict[str, slice], f) -> Embodiment:
 
 
 def _name(model, kind, index):
-    names = {"body": mujoco.mjtObj.mjOBJ_BODY, "joint": mujoco.mjtObj.mjOBJ_JOINT,
-             "actuator": mujoco.mjtObj.mjOBJ_ACTUATOR, "foot": mujoco.mjtObj.mjOBJ_GEOM}
+    names = {
+        "body": mujoco.mjtObj.mjOBJ_BODY,
+        "joint": mujoco.mjtObj.mjOBJ_JOINT,
+        "actuator": mujoco.mjtObj.mjOBJ_ACTUATOR,
+        "foot": mujoco.mjtObj.mjOBJ_GEOM,
+    }
     return mujoco.mj_id2name(model, names[kind], int(index)) or f"{kind}_{index}"
