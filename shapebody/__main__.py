@@ -1,0 +1,128 @@
+"""Command line for long runs: python -m shapebody train | sharpen | design | evaluate."""
+
+import argparse
+import os
+import sys
+
+# Actor and learner share the cores of a CPU; XLA's own thread pool would get in their way.
+# It must be said before JAX starts.
+_FLAG = "--xla_cpu_multi_thread_eigen=false"
+
+
+def main(arguments=None) -> int:
+    parser = argparse.ArgumentParser(prog="python -m shapebody", description=__doc__)
+    commands = parser.add_subparsers(dest="command", required=True)
+
+    train = commands.add_parser("train", help="train an agent, or continue its training")
+    train.add_argument("robots", nargs="+", help="names in data/robots, or MJCF files")
+    train.add_argument("--name", help="name of the agent (default: the robot's)")
+    train.add_argument("--scale", choices=("smoke", "reduced", "full"), help="default: reduced")
+    train.add_argument("--hours", type=float, help="stop after this time; run again to continue")
+    train.add_argument("--steps", type=int, help="stop at this many environment steps in all")
+    train.add_argument("--engine", choices=("auto", "native", "mjx"), default="auto")
+
+    sharpen = commands.add_parser(
+        "sharpen", help="policy evaluation: a new critic for an agent's frozen policy"
+    )
+    sharpen.add_argument("agent")
+    sharpen.add_argument("--name", help="name of the new agent (default: <agent>_critic)")
+    sharpen.add_argument("--steps", type=int, default=4_000_000)
+    sharpen.add_argument("--hours", type=float)
+
+    design = commands.add_parser("design", help="search for a better body")
+    design.add_argument("robot", help="name in data/robots, or an MJCF file")
+    design.add_argument("--agent", help="default: the agent named as the robot")
+    design.add_argument("--method", default="vgds")
+    design.add_argument("--start", type=int, help="start design number (default: the reference)")
+    design.add_argument("--trust-region", type=float, default=100.0, help="lambda (default 100)")
+    design.add_argument("--out", help="write the found body to this MJCF file")
+
+    evaluate = commands.add_parser("evaluate", help="return and tracking error of an agent")
+    evaluate.add_argument("agent")
+    evaluate.add_argument("--robot", help="default: the agent's first robot")
+    evaluate.add_argument("--start", type=int, help="start design number (default: the reference)")
+    evaluate.add_argument("--episodes", type=int, default=200)
+
+    options = parser.parse_args(arguments)
+    if options.command in ("train", "sharpen"):
+        os.environ["XLA_FLAGS"] = f"{os.environ.get('XLA_FLAGS', '')} {_FLAG}".strip()
+    from shapebody.runtime import enable_compilation_cache
+
+    enable_compilation_cache()
+    try:
+        {"train": _train, "sharpen": _sharpen, "design": _design, "evaluate": _evaluate}[
+            options.command
+        ](options)
+    except (ValueError, OSError) as error:
+        print(f"shapebody: {error}", file=sys.stderr)
+        return 1
+    return 0
+
+
+def _train(options):
+    from shapebody.experiments import scale
+    from shapebody.ppo import TrainConfig, train
+
+    changes = {"robots": tuple(options.robots)}
+    if options.name:
+        changes["name"] = options.name
+    config = TrainConfig.at_scale(options.scale or scale(), options.robots[0], **changes)
+    seconds = None if options.hours is None else 3600 * options.hours
+    agent = train(config, max_steps=options.steps, max_seconds=seconds, engine=options.engine)
+    print(f"agent {agent.name}: {agent.metadata['steps']:,} steps")
+
+
+def _sharpen(options):
+    from shapebody.checkpoints import load_agent
+    from shapebody.networks import CriticConfig
+    from shapebody.ppo import train_critic
+
+    agent = load_agent(options.agent)
+    seconds = None if options.hours is None else 3600 * options.hours
+    train_critic(agent, CriticConfig.sharp(), options.steps, name=options.name, max_seconds=seconds)
+
+
+def _design(options):
+    from pathlib import Path
+
+    import numpy as np
+
+    from shapebody.checkpoints import load_agent
+    from shapebody.design import DesignSpace
+    from shapebody.robots import load_robot
+    from shapebody.search import search
+
+    robot = load_robot(options.robot)
+    agent = load_agent(options.agent or robot.name)
+    space = DesignSpace(robot)
+    f = space.reference if options.start is None else space.start(options.start)
+    found = search(options.method, agent, robot, f, trust_region=options.trust_region)
+    print(f"{found.method}: {found.evaluations} critic evaluations, {found.seconds:.1f} s")
+    print(f"objective {found.history[0]:.2f} -> {found.history[-1]:.2f}")
+    for label, index in space.groups.items():
+        change = float(np.sqrt(np.mean(found.design[index] ** 2)))
+        print(f"  {label:32s} RMS change from the reference {change:.3f}")
+    if options.out:
+        Path(options.out).write_text(space.to_mjcf(found.design))
+        print(f"wrote {options.out}")
+
+
+def _evaluate(options):
+    from shapebody.checkpoints import load_agent
+    from shapebody.design import DesignSpace
+    from shapebody.evaluation import evaluate
+    from shapebody.robots import load_robot
+
+    agent = load_agent(options.agent)
+    robot = load_robot(options.robot or agent.robots[0])
+    space = DesignSpace(robot)
+    f = space.reference if options.start is None else space.start(options.start)
+    score = evaluate(agent, robot, f, episodes=options.episodes)
+    low, high = score.interval()
+    print(f"return {score.mean:.2f} (95 % interval {low:.2f} to {high:.2f})")
+    print(f"x-y tracking error {score.tracking_error.mean():.3f} m/s")
+    print(f"episode length {score.lengths.mean():.0f} control steps")
+
+
+if __name__ == "__main__":
+    sys.exit(main())
