@@ -6,10 +6,8 @@ reference robot. Φ is smooth in f (up to clipping), so that ∂V/∂f can follo
 
 from __future__ import annotations
 
-import copy
 import dataclasses
 import functools
-import xml.etree.ElementTree as ElementTree
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -18,6 +16,7 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
+from .mjcf import build_model, write_mjcf
 from .robots import Robot
 
 SOFT_LIMIT = 0.9  # soft limits span this fraction of a joint's range, about its midpoint
@@ -66,15 +65,21 @@ MODEL_FIELDS = tuple(
 
 
 class Block(NamedTuple):
-    """One block of the design vector: `over` × `components` entries with range constant `range`."""
+    """One block of the design vector: one entry per `over` and component."""
 
     key: str
     title: str
     kind: str
     over: str  # "global", "body", "joint", "actuator" or "foot"
     components: tuple[str, ...]
-    range: float
+    range: float  # range constant R, the relative or absolute change at f = 1
     unit: str
+
+    @property
+    def adds(self) -> bool:
+        """Whether an entry adds R f, in `unit`, instead of multiplying by 1 + R f."""
+        offsets = ("ipos", "iquat", "pos", "quat", "imu", "axis", "nominal", "range")
+        return self.key in offsets or self.key.endswith("_add")
 
 
 XYZ = ("x", "y", "z")
@@ -252,7 +257,7 @@ class DesignSpace:
             generator = np.random.default_rng(axes_seed)
             axes = rotation_axes(generator, robot.model.jnt_axis[robot.joints], robot.num_bodies)
         else:
-            axes = published_axes(robot, self.validate(published_axes_of))
+            axes = published_axes(robot, self._one(published_axes_of))
         self.inertia_axes, self.body_axes, self.joint_axes = axes
         self._check_layout()
         self._jitted = jax.jit(functools.partial(_embodiment, self._constants(), self.slices))
@@ -378,14 +383,30 @@ class DesignSpace:
         keyframe and the custom entries. Derived constants stay at the reference. The "same frame"
         flags are cleared: they would let MuJoCo ignore the changed frames of bodies and geoms.
         """
-        return _model(self, self.validate(f))
+        return build_model(self.robot, *self._single(f))
 
     def to_mjcf(self, f) -> str:
-        """MJCF text of design f [d] that any MuJoCo compiles.
+        """MJCF text of design f [d] that compiles in any MuJoCo.
 
-        See `shapebody.design.mjcf` for what differs from `to_model`.
+        It simulates as `to_model(f)` would with equally balanced inertias and recomputed derived
+        constants: MJCF cannot hold inertias that violate the triangle inequality, so these become
+        their mean, and a comment at the top says how many did. See `shapebody.mjcf.write_mjcf`.
         """
-        return mjcf(self, f)
+        return write_mjcf(self.robot, *self._single(f))
+
+    def _single(self, f) -> tuple[Embodiment, np.ndarray]:
+        """Embodiment and size factors (s_x, s_y, s_z) of one design."""
+        f = self._one(f)
+        return self(f), 1 + BLOCKS[0].range * f[self.slices["size"]]
+
+    def _one(self, f) -> np.ndarray:
+        f = self.validate(f)
+        if f.ndim != 1:
+            raise ValueError(
+                f"design has shape {f.shape}, expected one design [{self.dim}]; "
+                "take the designs of a batch one by one"
+            )
+        return f
 
 
 def _embodiment(constants: dict, slices: dict[str, slice], f) -> Embodiment:
@@ -473,11 +494,79 @@ def _embodiment(constants: dict, slices: dict[str, slice], f) -> Embodiment:
     )
 
 
-def _name(model, kind, index):
-    names = {
+def _name(model: mujoco.MjModel, over: str, index: int) -> str:
+    kind = {
         "body": mujoco.mjtObj.mjOBJ_BODY,
         "joint": mujoco.mjtObj.mjOBJ_JOINT,
         "actuator": mujoco.mjtObj.mjOBJ_ACTUATOR,
         "foot": mujoco.mjtObj.mjOBJ_GEOM,
+    }[over]
+    return mujoco.mj_id2name(model, kind, int(index)) or f"{over}_{index}"
+
+
+def _parameters(space: DesignSpace) -> list[Parameter]:
+    """The table of parameters, with their physical ranges when all others are at the reference."""
+    robot, model = space.robot, space.robot.model
+    trunk = _name(model, "body", robot.trunk)
+    ids = {
+        "global": [None],
+        "body": range(1, model.nbody),
+        "joint": robot.joints,
+        "actuator": range(model.nu),
+        "foot": robot.feet,
     }
-    return mujoco.mj_id2name(model, names[kind], int(index)) or f"{kind}_{index}"
+    dofs = model.jnt_dofadr[robot.joints]
+    references = {
+        "size": np.ones(3),
+        "coupled_mass": model.body_mass[1:],
+        "mass": model.body_mass[1:],
+        "inertia": model.body_inertia[1:],
+        "ipos": model.body_ipos[1:],
+        "pos": model.body_pos[1:],
+        "imu": model.site_pos[robot.imu_site],
+        "foot": model.geom_size[robot.feet],
+        "torque": model.actuator_forcerange[:, 1],
+        "nominal": robot.nominal,
+        "velocity": robot.velocity_limits,
+        "range": model.jnt_range[robot.joints],
+        "damping": model.dof_damping[dofs],
+        "armature": model.dof_armature[dofs],
+        "stiffness": model.jnt_stiffness[robot.joints],
+        "friction": model.dof_frictionloss[dofs],
+        "p_gain": np.array([robot.p_gain]),
+        "d_gain": np.array([robot.d_gain]),
+        "action_scale": np.array([robot.action_scale]),
+    }
+    limits = soft_limits(model.jnt_range[robot.joints[robot.actuated]])
+    table = []
+    for block in BLOCKS:
+        length = len(ids[block.over]) * len(block.components)
+        reference = references.get(block.key.removesuffix("_add"), np.zeros(length)).ravel()
+        change = block.range * (np.ones(length) if block.adds else reference)
+        values = np.stack([reference - change, reference + change])
+        if block.key == "nominal":
+            values = np.clip(values, limits[:, 0], limits[:, 1])
+        elif block.key.endswith("_add"):
+            values = np.maximum(values, 0)
+        names = [
+            (_name(model, block.over, index) if index is not None else "global", component)
+            for index in ids[block.over]
+            for component in block.components
+        ]
+        for (part, component), (low, high) in zip(names, values.T, strict=True):
+            part = trunk if block.key == "imu" else part
+            words = (part_label(part) if part != "global" else "", block.title, component)
+            name = " ".join(word for word in words if word)
+            table.append(
+                Parameter(
+                    index=len(table),
+                    name=name[0].upper() + name[1:],
+                    kind=block.kind,
+                    part=part,
+                    component=component,
+                    low=float(low),
+                    high=float(high),
+                    unit=block.unit,
+                )
+            )
+    return table
