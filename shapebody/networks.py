@@ -247,9 +247,7 @@ class PartEncoder(nn.Module):
             hidden = layer(elu(hidden))
         # The published clip of tanh to +-(1 - 1e-8) is the identity in float32.
         tanh_keys = jnp.tanh(hidden)
-        # No maximum is subtracted: |tanh / temperature| stays below 1 / minimum_temperature.
-        weights = jnp.exp(tanh_keys / self.temperature())
-        keys = weights / jnp.sum(weights, axis=-1, keepdims=True)
+        keys = nn.softmax(tanh_keys / self.temperature(), axis=-1)
         if self.direct_design:
             values = embedding["value"] + observations @ self.value_kernel[size:]
         else:
