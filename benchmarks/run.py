@@ -1,0 +1,198 @@
+"""Speed of the parts: python benchmarks/run.py [names...] [--out FILE]
+
+Every benchmark runs in a process of its own, on an otherwise idle machine if the numbers are to
+mean anything. Prints a table and writes it, with the machine and the versions, as JSON.
+"""
+
+import argparse
+import json
+import os
+import subprocess
+import sys
+import tempfile
+import time
+
+ROBOT = "unitree_go2"
+ENVIRONMENTS = 256
+
+
+def best(function, repeats=3):
+    """Shortest wall time of several calls, in seconds: the least disturbed one."""
+    times = []
+    for _ in range(repeats):
+        began = time.perf_counter()
+        function()
+        times.append(time.perf_counter() - began)
+    return min(times)
+
+
+def import_time():
+    """`import shapebody` in a fresh process, interpreter start excluded."""
+
+    def run(code):
+        return best(lambda: subprocess.run([sys.executable, "-c", code], check=True), 5)
+
+    return {"import": (run("import shapebody") - run("pass"), "s")}
+
+
+def engine():
+    """C MuJoCo alone: random designs, random targets, 4 substeps per control step."""
+    import jax
+    import numpy as np
+
+    from shapebody.design import DesignSpace
+    from shapebody.physics.native import NativePhysics
+    from shapebody.robots import load_robot
+
+    robot = load_robot(ROBOT)
+    space = DesignSpace(robot)
+    physics = NativePhysics(robot, ENVIRONMENTS)
+    designs = np.stack([space.start(i) for i in range(ENVIRONMENTS)])
+    embodiments = jax.tree.map(np.asarray, jax.jit(jax.vmap(space))(designs))
+    ids = np.arange(ENVIRONMENTS)
+    physics.set_designs(ids, embodiments)
+    rng = np.random.default_rng(0)
+    controls = robot.nominal + 0.1 * rng.normal(size=(50, ENVIRONMENTS, robot.num_actuators))
+
+    def steps():
+        for control in controls:
+            physics.step(control)
+
+    steps()
+    write = best(lambda: physics.set_designs(ids, embodiments)) / ENVIRONMENTS
+    return {
+        "C engine alone": (50 * ENVIRONMENTS / best(steps), "control steps/s"),
+        "write a design into C": (1e6 * write, "microseconds"),
+    }
+
+
+def _environment(engine, count, length):
+    import jax
+
+    from shapebody.locomotion import Locomotion
+    from shapebody.robots import load_robot
+
+    def act(params, key, descriptions, observation):
+        return 0.3 * jax.random.normal(key, observation.joints.shape[:-1]), ()
+
+    env = Locomotion(load_robot(ROBOT), count, engine=engine)
+    began = time.perf_counter()
+    state = env.reset(jax.random.PRNGKey(0), spread=True)
+    state, trajectory = env.rollout(act, None, state, jax.random.PRNGKey(1), length)
+    jax.block_until_ready(trajectory.reward)
+    first = time.perf_counter() - began
+    holder = [state]
+
+    def run():
+        holder[0], trajectory = env.rollout(act, None, holder[0], jax.random.PRNGKey(2), length)
+        jax.block_until_ready(trajectory.reward)
+
+    return count * length / best(run), first
+
+
+def environment():
+    """The whole environment on C MuJoCo with random actions, resets to new designs included."""
+    speed, first = _environment("native", ENVIRONMENTS, 64)
+    return {
+        "environment, C engine": (speed, "control steps/s"),
+        "environment, first call": (first, "s"),
+    }
+
+
+def mjx():
+    """The whole environment on MJX, one jitted scan."""
+    import jax
+
+    cpu = jax.default_backend() == "cpu"
+    count, length = (64, 16) if cpu else (4096, 64)
+    speed, first = _environment("mjx", count, length)
+    device = jax.devices()[0].device_kind
+    return {
+        f"environment, MJX on {device}, {count} at once": (speed, "control steps/s"),
+        "environment, MJX, first call": (first, "s"),
+    }
+
+
+def training():
+    """Training end to end at scale reduced: actor and learner together."""
+    from shapebody.ppo import TrainConfig, Trainer
+
+    with tempfile.TemporaryDirectory() as folder:
+        trainer = Trainer(TrainConfig.reduced(ROBOT), folder)
+        trainer.start()
+        trainer.run(max_steps=4 * trainer.config.batch, progress=False)
+        began, first = time.perf_counter(), trainer.steps
+        trainer.run(max_steps=first + 40 * trainer.config.batch, progress=False)
+        speed = (trainer.steps - first) / (time.perf_counter() - began)
+    return {"training, reduced": (speed, "environment steps/s")}
+
+
+def search():
+    """VGDS with the shipped agent, after compilation."""
+    import numpy as np
+
+    from shapebody.checkpoints import load_agent
+    from shapebody.design import DesignSpace
+    from shapebody.robots import load_robot
+    from shapebody.search import search
+
+    robot, agent = load_robot(ROBOT), load_agent(ROBOT)
+    space = DesignSpace(robot)
+    starts = np.stack([space.start(i) for i in range(10)])
+    rows = {}
+    for label, f in [("one design", starts[0]), ("ten designs", starts)]:
+        search("vgds", agent, robot, f)
+        rows[f"VGDS, {label}"] = (best(lambda f=f: search("vgds", agent, robot, f)), "s")
+    return rows
+
+
+BENCHMARKS = {
+    "import": import_time,
+    "engine": engine,
+    "environment": environment,
+    "training": training,
+    "search": search,
+    "mjx": mjx,
+}
+
+
+def main():
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("names", nargs="*", choices=[*BENCHMARKS, []], help="default: all")
+    parser.add_argument("--out", default="benchmarks/results.json")
+    parser.add_argument("--child", action="store_true", help=argparse.SUPPRESS)
+    options = parser.parse_args()
+    if options.child:
+        from shapebody.runtime import enable_compilation_cache
+
+        enable_compilation_cache()
+        print(json.dumps(BENCHMARKS[options.names[0]]()))
+        return
+    rows = {}
+    for name in options.names or BENCHMARKS:
+        environment = dict(os.environ)
+        if name == "training":
+            flags = environment.get("XLA_FLAGS", "")
+            environment["XLA_FLAGS"] = f"{flags} --xla_cpu_multi_thread_eigen=false".strip()
+        command = [sys.executable, __file__, name, "--child"]
+        output = subprocess.run(
+            command, env=environment, check=True, stdout=subprocess.PIPE, text=True
+        ).stdout
+        for label, (value, unit) in json.loads(output.splitlines()[-1]).items():
+            rows[label] = {"value": value, "unit": unit}
+            print(f"{label:52s} {value:12,.2f} {unit}", flush=True)
+    if "C engine alone" in rows and "environment, C engine" in rows:
+        ratio = rows["environment, C engine"]["value"] / rows["C engine alone"]["value"]
+        rows["environment / engine"] = {"value": ratio, "unit": ""}
+        print(f"{'environment / engine':52s} {ratio:12.2f}")
+    from shapebody.experiments import provenance
+
+    record = {"rows": rows, "provenance": provenance(robot=ROBOT, environments=ENVIRONMENTS)}
+    temporary = options.out + ".tmp"
+    with open(temporary, "w") as file:
+        json.dump(record, file, indent=1)
+    os.replace(temporary, options.out)
+
+
+if __name__ == "__main__":
+    main()
