@@ -1,0 +1,393 @@
+"""Returns of designs: rollouts of the frozen policy, and the statistics of comparing designs."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import time
+from dataclasses import dataclass, field
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from shapebody.checkpoints import Agent
+from shapebody.design import DesignSpace
+from shapebody.locomotion import Locomotion, TaskConfig
+from shapebody.networks import Policy, PolicyConfig
+from shapebody.robots import Robot
+
+CONFIDENCE = 0.95
+RESAMPLES = 10_000
+_CALLS = 50  # control steps per call of an engine that runs whole rollouts
+
+
+@dataclass(frozen=True)
+class EvaluationConfig:
+    """How designs are evaluated; the defaults are the paper's."""
+
+    episodes: int = 200
+    """Episodes per design."""
+    coefficient: float = 1.0
+    """Curriculum coefficient c of all episodes, in [0, 1]."""
+    task: TaskConfig = field(default_factory=TaskConfig.evaluation)
+    """Settings of the task."""
+    num_envs: int = 512
+    """Largest number of episodes that run side by side."""
+
+    def __post_init__(self):
+        for name in ("episodes", "num_envs"):
+            value = getattr(self, name)
+            if value != int(value) or value < 1:
+                raise ValueError(f"{name} is {value!r}; expected an integer of at least 1")
+        if not 0 <= self.coefficient <= 1:
+            raise ValueError(f"coefficient is {self.coefficient!r}; expected a number in [0, 1]")
+
+
+@dataclass(frozen=True, eq=False)
+class Evaluation:
+    """Episodes of the frozen policy on one design ([E]) or on S designs ([S, E]).
+
+    Column i of every design is the same episode: same commands, initial state, noise and pushes.
+
+    Attributes:
+        returns: float32, undiscounted sum of rewards until the episode ended.
+        tracking_error: float32, mean over time and both axes of |v_xy - c_xy| in m/s.
+        lengths: int32, control steps.
+        finite: bool, False where the simulation became invalid, which ended the episode.
+        seconds: wall time of the rollouts.
+        settings: robot, agent, engine, seed and the evaluation's configuration.
+    """
+
+    returns: np.ndarray
+    tracking_error: np.ndarray
+    lengths: np.ndarray
+    finite: np.ndarray
+    seconds: float
+    settings: dict
+
+    @property
+    def mean(self):
+        """Mean return per design, a float or [S]."""
+        return _out(self.returns.mean(-1))
+
+    @property
+    def mean_tracking_error(self):
+        """Mean tracking error per design in m/s, a float or [S]."""
+        return _out(self.tracking_error.mean(-1))
+
+    @property
+    def non_finite(self):
+        """Number of episodes that became invalid, an int or [S]."""
+        count = np.sum(~self.finite, -1)
+        return int(count) if np.ndim(count) == 0 else count
+
+    def interval(self, confidence: float = CONFIDENCE, seed: int = 0):
+        """Bootstrap interval (low, high) of the mean return over episodes, floats or [S] each."""
+        return bootstrap_interval(self.returns, confidence=confidence, seed=seed)
+
+    def summary(self) -> str:
+        """One line per design: mean return with its interval, tracking error, failures."""
+        low, high = (np.atleast_1d(x) for x in self.interval())
+        rows = zip(
+            np.atleast_1d(self.mean),
+            low,
+            high,
+            np.atleast_1d(self.mean_tracking_error),
+            np.atleast_1d(self.lengths.mean(-1)),
+            np.atleast_1d(self.non_finite),
+            strict=True,
+        )
+        episodes = self.returns.shape[-1]
+        return "\n".join(
+            f"return {mean:.2f} [{a:.2f}, {b:.2f}], tracking error {error:.3f} m/s, "
+            f"length {length:.0f}, {broken} of {episodes} episodes not finite"
+            for mean, a, b, error, length, broken in rows
+        )
+
+
+def evaluate(
+    agent: Agent,
+    robot: Robot,
+    designs,
+    episodes: int | None = None,
+    seed: int = 0,
+    engine: str = "auto",
+    config: EvaluationConfig | None = None,
+    progress: bool = False,
+) -> Evaluation:
+    """Roll out the frozen policy with mean actions on one design [d] or several [S, d].
+
+    Episode i of every design has the same random numbers, so that differences between designs are
+    paired. Results repeat on the same machine for the same designs, episodes and seed. In another
+    batch, float rounding makes single episodes drift apart; only their statistics agree.
+
+    Args:
+        agent: its policy is used; any number of joints fits.
+        robot: the robot whose designs these are.
+        designs: normalized designs in [-1, 1].
+        episodes: episodes per design; 200 unless `config` says otherwise.
+        seed: of the episodes.
+        engine: "native", "mjx" or "auto" (native on a CPU).
+        config: everything else.
+        progress: print how far it is.
+
+    Raises:
+        ValueError: for designs of a wrong length, outside the box or not finite, a wrong number
+            of episodes, an unknown engine.
+    """
+    config = config or EvaluationConfig()
+    if episodes is not None:
+        config = dataclasses.replace(config, episodes=episodes)
+    space = DesignSpace(robot)
+    designs = space.validate(designs)
+    if designs.ndim > 2 or len(designs) == 0:
+        raise ValueError(
+            f"designs have shape {designs.shape}; expected one design [{space.dim}] or at least "
+            f"one row of [S, {space.dim}]"
+        )
+    rows = np.atleast_2d(designs)
+    total = len(rows) * config.episodes
+    chunks = -(-total // config.num_envs)
+    size = -(-total // chunks)
+    env = _environment(robot, size, engine, config.task)
+    keys = np.asarray(_episode_keys(seed, config.episodes))
+    measured = []
+    began = time.perf_counter()
+    for chunk in range(chunks):
+        # The last chunk is filled up with its own last episode.
+        index = np.minimum(np.arange(chunk * size, (chunk + 1) * size), total - 1)
+        design, episode = np.divmod(index, config.episodes)
+        report = functools.partial(_report, chunk, chunks) if progress else None
+        measured.append(_run(env, agent, rows[design], keys[episode], config.coefficient, report))
+    if progress:
+        print(flush=True)
+    seconds = time.perf_counter() - began
+    shape = designs.shape[:-1] + (config.episodes,)
+    results = _Episodes(
+        *(np.concatenate(parts)[:total].reshape(shape) for parts in zip(*measured, strict=True))
+    )
+    return Evaluation(
+        **results._asdict(),
+        seconds=seconds,
+        settings={
+            "robot": robot.name,
+            "agent": agent.name,
+            "agent_hash": agent.hash,
+            "engine": env.engine,
+            "seed": seed,
+            **dataclasses.asdict(config),
+        },
+    )
+
+
+class _Episodes(NamedTuple):
+    """One entry per episode."""
+
+    returns: np.ndarray
+    tracking_error: np.ndarray
+    lengths: np.ndarray
+    finite: np.ndarray
+
+
+def _report(chunk: int, chunks: int, share: float):
+    print(f"\revaluated {(chunk + share) / chunks:4.0%}", end="", flush=True)
+
+
+def _run(env: Locomotion, agent: Agent, designs, keys, coefficient, report) -> _Episodes:
+    """One episode in every environment."""
+    n = env.num_envs
+    policy = _policy(agent.policy_config)
+    state = env.reset(
+        jax.random.PRNGKey(0), designs, coefficient=coefficient, keys=jnp.asarray(keys)
+    )
+    params = _embed(agent.policy_config)(agent.policy, state.descriptions)
+    result = _Episodes(
+        returns=np.zeros(n, np.float32),
+        tracking_error=np.zeros(n, np.float32),
+        lengths=np.zeros(n, np.int32),
+        finite=np.ones(n, bool),
+    )
+    running = np.ones(n, bool)
+    key = jax.random.PRNGKey(0)  # mean actions need no random numbers
+    horizon = env.config.horizon
+    step = 0
+    while running.any():
+        if env.engine == "native":
+            state, record, _ = env.step(policy, params, state, key)
+            records = [record]
+        else:
+            length = min(_CALLS, horizon - step)
+            state, trajectory = env.rollout(policy, params, state, key, length)
+            records = _rows(trajectory, length)
+        for record in records:
+            ended = running & (record.terminated | record.truncated)
+            if ended.any():
+                result.returns[ended] = record.episode_return[ended]
+                result.tracking_error[ended] = record.episode_error[ended]
+                result.lengths[ended] = record.episode_length[ended]
+                result.finite[ended] = record.finite[ended]
+                running &= ~ended
+            step += 1
+        if report is not None and (step % _CALLS == 0 or not running.any()):
+            report(step / horizon if running.any() else 1.0)
+    return result
+
+
+class _Row(NamedTuple):
+    terminated: np.ndarray
+    truncated: np.ndarray
+    finite: np.ndarray
+    episode_return: np.ndarray
+    episode_error: np.ndarray
+    episode_length: np.ndarray
+
+
+def _rows(trajectory, length: int):
+    columns = [np.asarray(getattr(trajectory, name)) for name in _Row._fields]
+    return [_Row(*(column[t] for column in columns)) for t in range(length)]
+
+
+@functools.lru_cache
+def _policy(config: PolicyConfig):
+    """Mean actions for `Locomotion`; params are the variables and the embedded descriptions."""
+    module = Policy(config)
+
+    def act(params, key, descriptions, observation):
+        variables, embedding = params
+        mean, _ = module.apply(variables, embedding, descriptions, observation, method="act")
+        return mean, ()
+
+    return act
+
+
+@functools.lru_cache
+def _embed(config: PolicyConfig):
+    module = Policy(config)
+
+    def embed(variables, descriptions):
+        return variables, module.apply(variables, descriptions, method="embed")
+
+    return jax.jit(embed)
+
+
+@functools.lru_cache(maxsize=4)
+def _environment(robot: Robot, num_envs: int, engine: str, task: TaskConfig) -> Locomotion:
+    return Locomotion(robot, num_envs, engine, task, auto_reset=False)
+
+
+@functools.partial(jax.jit, static_argnums=1)
+def _episode_keys(seed, episodes: int):
+    # Folding in the number of the episode: more episodes leave the first ones unchanged.
+    key = jax.random.PRNGKey(seed)
+    return jax.vmap(lambda i: jax.random.fold_in(key, i))(jnp.arange(episodes))
+
+
+# ---------------------------------------------------------------------- statistics
+
+
+def bootstrap_interval(
+    values,
+    baseline=None,
+    *,
+    confidence: float = CONFIDENCE,
+    resamples: int = RESAMPLES,
+    seed: int = 0,
+):
+    """Percentile bootstrap interval of a mean over the last axis.
+
+    Args:
+        values: [..., n] independent numbers, such as the returns of n episodes or of n starts.
+        baseline: [..., n] numbers paired with them; the interval is then that of the mean
+            difference values - baseline.
+        confidence: coverage, between 0 and 1.
+        resamples: number of bootstrap samples.
+        seed: of the resampling; the same resamples are used for all leading axes.
+
+    Returns:
+        (low, high), floats or arrays [...].
+
+    Raises:
+        ValueError: for empty or non-finite values, a baseline of another shape, a confidence
+            outside (0, 1).
+    """
+    values = _differences(values, baseline)
+    if not 0 < confidence < 1:
+        raise ValueError(f"confidence is {confidence!r}; expected a number between 0 and 1")
+    n = values.shape[-1]
+    counts = np.random.default_rng(seed).multinomial(n, np.full(n, 1 / n), size=resamples)
+    means = values @ (counts.T / n)
+    tail = (1 - confidence) / 2
+    low, high = np.quantile(means, [tail, 1 - tail], axis=-1)
+    return _out(low), _out(high)
+
+
+class Gain(NamedTuple):
+    """A mean paired difference and its interval."""
+
+    mean: float
+    low: float
+    high: float
+    differences: np.ndarray
+    """[S], one per start (or [E], one per episode of a single design)."""
+
+
+def paired_gain(
+    after: Evaluation | np.ndarray,
+    before: Evaluation | np.ndarray,
+    *,
+    confidence: float = CONFIDENCE,
+    resamples: int = RESAMPLES,
+    seed: int = 0,
+) -> Gain:
+    """Gain in return ΔR of designs `after` over designs `before`, paired by start.
+
+    With [S, E] returns the unit is the start: episodes are averaged first, and the interval is a
+    bootstrap over the S starts. With [E] returns of one design it is a bootstrap over the paired
+    episodes. Evaluate both with the same seed.
+
+    Raises:
+        ValueError: if the shapes differ, or the two evaluations had other seeds or settings.
+    """
+    if isinstance(after, Evaluation) and isinstance(before, Evaluation):
+        for name in ("robot", "engine", "seed", "coefficient", "task"):
+            if after.settings[name] != before.settings[name]:
+                raise ValueError(
+                    f"the evaluations differ in {name}: {after.settings[name]!r} and "
+                    f"{before.settings[name]!r}; repeat one with the settings of the other"
+                )
+    after, before = (
+        np.asarray(x.returns if isinstance(x, Evaluation) else x, np.float64)
+        for x in (after, before)
+    )
+    differences = _differences(after, before)
+    if differences.ndim > 2:
+        raise ValueError(f"returns have shape {differences.shape}; expected [E] or [S, E]")
+    if differences.ndim == 2:
+        differences = differences.mean(-1)
+    low, high = bootstrap_interval(
+        differences, confidence=confidence, resamples=resamples, seed=seed
+    )
+    return Gain(float(differences.mean()), low, high, differences)
+
+
+def _differences(values, baseline):
+    values = np.asarray(values, np.float64)
+    if values.ndim == 0 or values.shape[-1] == 0:
+        raise ValueError(f"values have shape {values.shape}; expected [..., n] with n >= 1")
+    if baseline is not None:
+        baseline = np.asarray(baseline, np.float64)
+        if baseline.shape != values.shape:
+            raise ValueError(
+                f"values {values.shape} and baseline {baseline.shape} have different shapes; "
+                "paired numbers need the same"
+            )
+        values = values - baseline
+    if not np.isfinite(values).all():
+        raise ValueError("values contain numbers that are not finite; remove or replace them")
+    return values
+
+
+def _out(value):
+    return float(value) if np.ndim(value) == 0 else value

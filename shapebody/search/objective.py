@@ -1,0 +1,248 @@
+"""The design objective (eq. 5): mean value over the state bank minus the trust-region penalty."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from shapebody.checkpoints import Agent
+from shapebody.descriptions import Descriptions, Sizes, describe
+from shapebody.design import DesignSpace
+from shapebody.locomotion.observations import Observation
+from shapebody.networks import Critic, CriticConfig
+from shapebody.robots import Robot
+
+MAX_ROWS = 8192
+"""Most (design, state) pairs that the critic sees at once (a state for every design at least)."""
+
+
+@dataclass(frozen=True, eq=False)
+class DesignCritic:
+    """The critic as a function of the normalized design: V(s, Φ(f)) for one robot.
+
+    Instances are shared (`design_critic`), so that what was compiled for one is compiled for all
+    searches on that robot with a critic of that size.
+    """
+
+    space: DesignSpace
+    describe: Callable
+    critic: Critic
+
+    def descriptions(self, designs) -> Descriptions:
+        """Descriptions of designs [S, d]."""
+        return self.describe(self.space(designs))
+
+    def __call__(self, variables, descriptions: Descriptions, states: Observation):
+        """Values [S, B, K] of S described designs in B states."""
+        descriptions = jax.tree.map(lambda x: x[:, None], descriptions)
+        return self.critic.apply(variables, descriptions, states)
+
+
+_critics: dict[Any, DesignCritic] = {}
+
+
+def design_critic(robot: Robot, config: CriticConfig) -> DesignCritic:
+    """The `DesignCritic` of a robot and a critic's configuration, built once."""
+    key = (robot.path, robot.xml, config)
+    if key not in _critics:
+        # Padding has no influence, so the robot's own sizes do, and are the fastest.
+        _critics[key] = DesignCritic(DesignSpace(robot), describe(robot), Critic(config))
+    return _critics[key]
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True, eq=False)
+class Objective:
+    r"""Ĵ_λ(f) = 1/M Σ_m V̄(s_m, Φ(f)) - λ |f - f_ref|² / d (eq. 5), to be maximized.
+
+    V̄ is the mean over the critic's heads. The states s_m give what changes while walking (joint
+    and foot observations, velocities, commands); everything that describes the body comes from
+    Φ(f). A pytree: it can be an argument of jitted functions, and another λ, reference, critic or
+    seed needs no new compilation.
+
+    Attributes:
+        critic: variables of the critic.
+        states: the state bank, an Observation with leading axis M.
+        reference: f_ref, float32 [d].
+        trust_region: λ, float32 [].
+        values: the critic as a function of designs and states.
+        batch_size: states per minibatch.
+    """
+
+    critic: Any
+    states: Observation
+    reference: jax.Array
+    trust_region: jax.Array
+    values: DesignCritic = field(metadata=dict(static=True))
+    batch_size: int = field(default=64, metadata=dict(static=True))
+
+    @classmethod
+    def of(
+        cls,
+        agent: Agent,
+        robot: Robot,
+        trust_region: float = 100.0,
+        reference=None,
+        states: Observation | None = None,
+        batch_size: int = 64,
+    ) -> Objective:
+        """The objective of an agent for a robot.
+
+        Args:
+            agent: frozen agent whose critic is asked.
+            robot: the robot to be designed.
+            trust_region: penalty coefficient λ >= 0.
+            reference: f_ref [d] in [-1, 1]; the robot as it is (f = 0) if not given.
+            states: state bank to use; `bank(agent, robot)` if not given.
+            batch_size: states per minibatch.
+
+        Raises:
+            ValueError: for a λ that is negative or not finite, a wrong reference or batch size,
+                and an agent without states that fit the robot.
+        """
+        if not (np.isscalar(trust_region) and np.isfinite(trust_region) and trust_region >= 0):
+            raise ValueError(
+                f"trust_region is {trust_region!r}; expected a finite number of at least 0 "
+                "(the penalty coefficient, 100 in the paper)"
+            )
+        if batch_size != int(batch_size) or batch_size < 1:
+            raise ValueError(f"batch_size is {batch_size!r}; expected an integer of at least 1")
+        values = design_critic(robot, agent.critic_config)
+        space = values.space
+        reference = space.reference if reference is None else space.validate(reference)
+        if reference.ndim != 1:
+            raise ValueError(
+                f"reference has shape {reference.shape}; expected one design [{space.dim}]"
+            )
+        states = bank(agent, robot) if states is None else trim(states, robot)
+        return cls(
+            critic=jax.tree.map(jnp.asarray, agent.critic),
+            states=jax.tree.map(lambda x: jnp.asarray(x, jnp.float32), states),
+            reference=jnp.asarray(reference),
+            trust_region=jnp.asarray(trust_region, jnp.float32),
+            values=values,
+            batch_size=int(batch_size),
+        )
+
+    @property
+    def dim(self) -> int:
+        """Length d of a design."""
+        return self.reference.shape[-1]
+
+    @property
+    def num_states(self) -> int:
+        """Size M of the state bank."""
+        return self.states.general.shape[0]
+
+    def batch(self, key) -> Observation:
+        """A minibatch of states, drawn without replacement; the whole bank if it is smaller."""
+        if self.num_states <= self.batch_size:
+            return self.states
+        chosen = jax.random.choice(key, self.num_states, (self.batch_size,), replace=False)
+        return jax.tree.map(lambda x: x[chosen], self.states)
+
+    def value(self, designs, states: Observation | None = None):
+        """Mean of V̄ over `states` (the whole bank if not given) for designs [..., d] -> [...]."""
+        designs = jnp.asarray(designs, jnp.float32)
+        states = self.states if states is None else states
+        rows = designs.reshape(-1, designs.shape[-1])
+        return _mean_value(self, rows, states).reshape(designs.shape[:-1])
+
+    def penalty(self, designs):
+        """λ |f - f_ref|² / d for designs [..., d] -> [...]."""
+        difference = jnp.asarray(designs, jnp.float32) - self.reference
+        return self.trust_region * jnp.sum(difference**2, -1) / self.dim
+
+    def __call__(self, designs, states: Observation | None = None):
+        """Ĵ_λ of designs [..., d] -> [...], on `states` or the whole bank.
+
+        A value that is not finite counts as the worst, -inf.
+        """
+        total = self.value(designs, states) - self.penalty(designs)
+        return jnp.where(jnp.isfinite(total), total, -jnp.inf)
+
+
+@jax.jit
+def _mean_value(objective: Objective, designs, states: Observation):
+    """Mean value [S] of designs [S, d] over states and heads, in slices of the states."""
+    descriptions = objective.values.descriptions(designs)
+    count = states.general.shape[0]
+    size = min(count, max(1, MAX_ROWS // len(designs)))
+    if size == count:
+        values = objective.values(objective.critic, descriptions, states)
+        return jnp.mean(values, axis=(-2, -1))
+    slices = -(-count // size)
+    index = np.arange(slices * size)
+    parts = jax.tree.map(lambda x: x[(index % count).reshape(slices, size)], states)
+    weight = jnp.asarray((index < count).reshape(slices, size), jnp.float32)
+
+    def total(part):
+        states, weight = part
+        values = objective.values(objective.critic, descriptions, states)
+        return jnp.sum(jnp.mean(values, axis=-1) * weight, axis=-1)
+
+    return jnp.sum(jax.lax.map(total, (parts, weight)), axis=0) / count
+
+
+def bank(agent: Agent, robot: Robot) -> Observation:
+    """The agent's states on which designs of `robot` are judged, in the robot's own sizes.
+
+    For a robot that the agent was trained on, these are the states of that robot. Any other robot
+    borrows all states of robots with at least as many joints and feet: its joint j is observed as
+    joint j of the lender, and the joints it does not have are left out. States of smaller robots
+    are not used, because their padding is no observation of a foot.
+
+    Raises:
+        ValueError: if no state fits.
+    """
+    if agent.states is None:
+        raise ValueError(
+            f"agent {agent.name!r} has no state bank; give states=, observations from rollouts of "
+            "its policy"
+        )
+    states, owners = jax.tree.map(np.asarray, agent.states), np.asarray(agent.state_robots)
+    if robot.name in agent.robots:
+        chosen = owners == agent.robots.index(robot.name)
+        if chosen.any():
+            return trim(jax.tree.map(lambda x: x[chosen], states), robot)
+    fitting = [
+        index
+        for index in range(len(agent.robots))
+        if _used(states.joints[owners == index]) >= robot.num_actuators
+        and _used(states.feet[owners == index]) >= robot.num_feet
+    ]
+    chosen = np.isin(owners, fitting)
+    if not chosen.any():
+        raise ValueError(
+            f"agent {agent.name!r} (robots: {', '.join(agent.robots)}) has no states with the "
+            f"{robot.num_actuators} joints and {robot.num_feet} feet of robot {robot.name!r}; use "
+            "an agent trained on such a robot, or give states= from rollouts of its policy"
+        )
+    return trim(jax.tree.map(lambda x: x[chosen], states), robot)
+
+
+def trim(states: Observation, robot: Robot) -> Observation:
+    """States [M, ...] cut to the joints and feet of `robot`; ValueError if they have fewer."""
+    own = Sizes.of(robot)
+    for name, needed in (("joints", own.joints), ("feet", own.feet)):
+        shape = np.shape(getattr(states, name))
+        if len(shape) != 3 or shape[0] == 0 or shape[1] < needed:
+            raise ValueError(
+                f"states.{name} has shape {shape}; robot {robot.name!r} needs at least one state "
+                f"with {needed} {name}: [M, {needed} or more, ...]"
+            )
+    return dataclasses.replace(
+        states, joints=states.joints[:, : own.joints], feet=states.feet[:, : own.feet]
+    )
+
+
+def _used(parts: np.ndarray) -> int:
+    """Number of parts [M, parts, n] that are not padding; padding is zero in every state."""
+    present = np.flatnonzero(np.any(parts != 0, axis=(0, 2)))
+    return int(present[-1]) + 1 if len(present) else 0
