@@ -122,7 +122,7 @@ def result(name: str, compute: Callable[[], list[dict]], agent=None, recompute=F
     if path.exists() and not recompute and scale() != "smoke":
         try:
             stored = json.loads(path.read_text())
-            source = stored["provenance"]
+            source, _ = stored["provenance"], stored["records"]
             same = source["config"] == config
             same &= agent is None or source["agent"]["hash"] == agent.hash
         except (json.JSONDecodeError, KeyError, TypeError) as error:
@@ -162,12 +162,13 @@ def single_robot_design(
 
     Returns:
         One record per design: origin ("start" or "reference"), start number, method ("none",
-        "vgds", "penalty-only"), trust_region, mean return, tracking error, length, share of
-        episodes that became non-finite, predicted value (mean critic value without penalty), and
-        the search's seconds per design.
+        "vgds", "penalty-only"), trust_region, the search's seconds per design, mean return, its
+        deviation over episodes, the gain over the design where the search began with its 95 %
+        interval over paired episodes, tracking error, length, number of episodes that became
+        non-finite, and predicted value (mean critic value without penalty).
     """
     from shapebody.design import DesignSpace
-    from shapebody.evaluation import evaluate
+    from shapebody.evaluation import evaluate, paired_gain
     from shapebody.search import Objective, search
 
     space = DesignSpace(robot)
@@ -199,15 +200,122 @@ def single_robot_design(
     predicted = Objective.of(agent, robot, 0.0).value(designs)
     score = evaluate(agent, robot, designs, episodes=episodes, seed=seed, progress=progress)
     for i, record in enumerate(records):
+        began = starts if record["origin"] == "reference" else record["start"]
+        gain = paired_gain(score.returns[i], score.returns[began])
         record |= {
             "return": float(score.returns[i].mean()),
             "return_std": float(score.returns[i].std(ddof=1)) if episodes > 1 else 0.0,
+            "gain": gain.mean,
+            "gain_low": gain.low,
+            "gain_high": gain.high,
+            "non_finite": int(score.non_finite[i]),
             "tracking_error": float(score.tracking_error[i].mean()),
             "length": float(score.lengths[i].mean()),
             "predicted_value": float(predicted[i]),
             "episodes": episodes,
         }
     return records
+
+
+def gains(records: list[dict]) -> list[dict]:
+    """Gains in return ΔR with 95 % intervals, from the records of `single_robot_design`.
+
+    Returns:
+        One record per comparison: method, over ("start", "penalty-only" or "reference"),
+        trust_region (None where none was used), mean, low and high of the paired difference in
+        return, the number of pairs, and how many of them are positive. The pairs are the starts;
+        for the search from the reference they are the episodes of one pair of designs.
+
+    Raises:
+        ValueError: if a design has no counterpart to be compared with.
+    """
+    from shapebody.evaluation import paired_gain
+
+    found: dict = {}
+    for record in records:
+        if record["origin"] == "start":
+            key = record["method"], record["trust_region"]
+            found.setdefault(key, {})[record["start"]] = record["return"]
+    reference = [r for r in records if r["origin"] == "reference"]
+    base = [r["return"] for r in reference if r["method"] == "none"]
+    initial = found.get(("none", None), {})
+    if len(base) != 1 or not initial:
+        raise ValueError(
+            f"the records hold {len(base)} evaluations of the reference and {len(initial)} of "
+            "starts; expected one and at least one, as single_robot_design returns them"
+        )
+    rows = []
+
+    def compare(method, over, trust_region, after, before):
+        if after.keys() != before.keys():
+            raise ValueError(
+                f"{method} at lambda {trust_region} has starts {sorted(after)}, {over} has "
+                f"{sorted(before)}; both need the same, compute the records anew"
+            )
+        order = sorted(after)
+        gain = paired_gain([after[i] for i in order], [before[i] for i in order])
+        row(method, over, trust_region, *gain[:3], len(order), int(np.sum(gain.differences > 0)))
+
+    def row(method, over, trust_region, mean, low, high, pairs, positive):
+        values = dict(mean=mean, low=low, high=high, pairs=pairs, positive=positive)
+        rows.append({"method": method, "over": over, "trust_region": trust_region, **values})
+
+    compare("reference", "start", None, dict.fromkeys(initial, base[0]), initial)
+    for (method, trust_region), after in found.items():
+        if method == "none":
+            continue
+        compare(method, "start", trust_region, after, initial)
+        if method != "penalty-only":
+            control = found.get(("penalty-only", trust_region), {})
+            compare(method, "penalty-only", trust_region, after, control)
+    for r in reference:
+        if r["method"] != "none":
+            interval = r["gain"], r["gain_low"], r["gain_high"]
+            row(r["method"], "reference", r["trust_region"], *interval, r["episodes"], None)
+    return rows
+
+
+def gain(rows: list[dict], method: str, over: str, trust_region: float | None = None) -> dict:
+    """The one row of `gains` with that method, comparison and λ; ValueError if there is none."""
+    wanted = {"method": method, "over": over, "trust_region": trust_region}
+    for row in rows:
+        if all(row[name] == value for name, value in wanted.items()):
+            return row
+    known = ", ".join(f"{r['method']} over {r['over']} at {r['trust_region']}" for r in rows)
+    raise ValueError(f"there is no gain of {method} over {over} at {trust_region}; known: {known}")
+
+
+def verdict(low: float, high: float) -> str:
+    """What an interval of a difference allows to say about its sign."""
+    if low > 0:
+        return "positive: the whole interval is above zero"
+    if high < 0:
+        return "negative: the whole interval is below zero"
+    return "not settled: the interval contains zero"
+
+
+def rank_correlation(x, y, resamples: int = 2000, seed: int = 0) -> tuple[float, float, float]:
+    """Spearman's ρ of x and y [n] and its 95 % bootstrap interval over pairs: (ρ, low, high).
+
+    NaN where ρ does not exist because x or y is constant. Raises ValueError below three pairs.
+    """
+    from scipy.stats import rankdata
+
+    x, y = np.asarray(x, float), np.asarray(y, float)
+    if x.shape != y.shape or x.ndim != 1 or len(x) < 3:
+        raise ValueError(f"x {x.shape} and y {y.shape}: expected two lists of three or more pairs")
+
+    def correlation(x, y):
+        a, b = (rankdata(v, axis=-1) for v in (x, y))
+        a, b = (v - v.mean(-1, keepdims=True) for v in (a, b))
+        scale = np.sqrt((a * a).sum(-1) * (b * b).sum(-1))
+        return np.where(scale > 0, (a * b).sum(-1) / np.where(scale > 0, scale, 1.0), np.nan)
+
+    chosen = np.random.default_rng(seed).integers(0, len(x), (resamples, len(x)))
+    samples = correlation(x[chosen], y[chosen])
+    samples = samples[np.isfinite(samples)]
+    low, high = np.quantile(samples, [0.025, 0.975]) if len(samples) else (np.nan, np.nan)
+    return float(correlation(x, y)), float(low), float(high)
 
 
 def value_against_return(

@@ -1,0 +1,172 @@
+import json
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from shapebody import experiments
+
+AGENT = SimpleNamespace(name="a", hash="1234", metadata={"steps": 7})
+
+
+@pytest.fixture
+def results(tmp_path, monkeypatch):
+    monkeypatch.setenv("SHAPEBODY_DATA", str(tmp_path))
+    monkeypatch.setenv("SHAPEBODY_SCALE", "reduced")
+    return tmp_path / "results"
+
+
+class Computation:
+    def __init__(self):
+        self.calls = 0
+
+    def __call__(self):
+        self.calls += 1
+        return [{"call": self.calls}]
+
+
+# scales
+
+
+def test_scale_is_read_from_the_environment(monkeypatch):
+    monkeypatch.delenv("SHAPEBODY_SCALE", raising=False)
+    assert experiments.scale() == "reduced"
+    monkeypatch.setenv("SHAPEBODY_SCALE", "smoke")
+    assert experiments.budget().starts == experiments.BUDGETS["smoke"].starts
+    monkeypatch.setenv("SHAPEBODY_SCALE", "huge")
+    with pytest.raises(ValueError, match="huge.*smoke, reduced, full"):
+        experiments.scale()
+
+
+def test_scales_table_has_a_row_per_scale():
+    rows = experiments.scales_table()
+    assert [row["scale"] for row in rows] == list(experiments.BUDGETS)
+    assert json.dumps(rows)
+
+
+# stored results
+
+
+def test_result_is_computed_once_and_loaded_afterwards(results):
+    compute = Computation()
+    first = experiments.result("x", compute, AGENT, starts=2)
+    second = experiments.result("x", compute, AGENT, starts=2)
+    assert compute.calls == 1
+    assert first == second == json.loads((results / "x.json").read_text())
+    assert first["provenance"]["agent"] == {"name": "a", "hash": "1234", "steps": 7}
+
+
+def test_result_of_another_agent_or_setting_is_computed_anew(results):
+    compute = Computation()
+    experiments.result("x", compute, AGENT, starts=2)
+    experiments.result("x", compute, AGENT, starts=3)
+    other = SimpleNamespace(name="a", hash="5678", metadata={})
+    stored = experiments.result("x", compute, other, starts=3)
+    assert compute.calls == 3
+    assert stored["provenance"]["agent"]["hash"] == "5678"
+    experiments.result("x", compute, other, recompute=True, starts=3)
+    assert compute.calls == 4
+
+
+def test_full_scale_has_its_own_file(results, monkeypatch):
+    monkeypatch.setenv("SHAPEBODY_SCALE", "full")
+    experiments.result("x", Computation(), AGENT)
+    assert [path.name for path in results.iterdir()] == ["x_full.json"]
+
+
+def test_smoke_scale_neither_reads_nor_writes(results, monkeypatch):
+    compute = Computation()
+    experiments.result("x", compute, AGENT)
+    monkeypatch.setenv("SHAPEBODY_SCALE", "smoke")
+    before = (results / "x.json").read_text()
+    assert experiments.result("x", compute, AGENT)["records"] == [{"call": 2}]
+    experiments.result("y", compute, AGENT)
+    assert (results / "x.json").read_text() == before
+    assert [path.name for path in results.iterdir()] == ["x.json"]
+
+
+@pytest.mark.parametrize(
+    "text", ["", "{", "[]", "{}", '{"provenance": {"config": {}}}', '{"provenance": 1}']
+)
+def test_damaged_file_is_reported_and_can_be_recomputed(results, text):
+    results.mkdir()
+    (results / "x.json").write_text(text)
+    with pytest.raises(ValueError, match="x.json.*damaged.*recompute=True"):
+        experiments.result("x", Computation(), AGENT)
+    assert experiments.result("x", Computation(), AGENT, recompute=True)["records"]
+
+
+def test_interrupted_computation_leaves_the_file_as_it_was(results):
+    experiments.result("x", Computation(), AGENT)
+    before = (results / "x.json").read_text()
+
+    def interrupted():
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        experiments.result("x", interrupted, AGENT, recompute=True)
+    assert (results / "x.json").read_text() == before
+
+
+# gains
+
+
+def record(origin, start, method, trust_region, value, **more):
+    keys = dict(origin=origin, start=start, method=method, trust_region=trust_region)
+    return {**keys, "return": value, "episodes": 4, **more}
+
+
+def synthetic(vgds=(7.0, 9.0, 8.0), penalty=(6.0, 7.5, 7.0)):
+    initial = (1.0, 2.0, 3.0)
+    records = [record("start", i, "none", None, x) for i, x in enumerate(initial)]
+    records += [record("start", i, "vgds", 20.0, x) for i, x in enumerate(vgds)]
+    # The order of records must not matter.
+    records += [record("start", i, "penalty-only", 20.0, x) for i, x in enumerate(penalty)][::-1]
+    records.append(record("reference", None, "none", None, 5.0, gain=0.0))
+    interval = dict(gain=0.5, gain_low=0.2, gain_high=0.8)
+    return records + [record("reference", None, "vgds", 20.0, 5.5, **interval)]
+
+
+def test_gains_are_paired_by_start():
+    rows = experiments.gains(synthetic())
+    one = experiments.gain(rows, "vgds", "penalty-only", 20.0)
+    assert one["mean"] == pytest.approx((1 + 1.5 + 1) / 3)
+    assert 1 <= one["low"] <= one["mean"] <= one["high"] <= 1.5
+    assert (one["pairs"], one["positive"]) == (3, 3)
+    assert experiments.gain(rows, "vgds", "start", 20.0)["mean"] == pytest.approx(6)
+    assert experiments.gain(rows, "penalty-only", "start", 20.0)["mean"] == pytest.approx(29 / 6)
+    reference = experiments.gain(rows, "reference", "start")
+    assert (reference["mean"], reference["positive"]) == (pytest.approx(3), 3)
+    own = experiments.gain(rows, "vgds", "reference", 20.0)
+    assert (own["mean"], own["low"], own["high"], own["pairs"]) == (0.5, 0.2, 0.8, 4)
+
+
+def test_gains_of_incomplete_records():
+    with pytest.raises(ValueError, match="both need the same"):
+        experiments.gains(synthetic(penalty=(6.0, 7.5)))
+    with pytest.raises(ValueError, match="0 evaluations of the reference"):
+        experiments.gains(synthetic()[:9])
+    with pytest.raises(ValueError, match="no gain of vgds over start at 5"):
+        experiments.gain(experiments.gains(synthetic()), "vgds", "start", 5.0)
+
+
+@pytest.mark.parametrize(
+    "low, high, word", [(0.1, 1, "positive"), (-1, -0.1, "negative"), (-1, 1, "not settled")]
+)
+def test_verdict(low, high, word):
+    assert experiments.verdict(low, high).startswith(word)
+
+
+def test_rank_correlation_agrees_with_scipy():
+    from scipy.stats import spearmanr
+
+    generator = np.random.default_rng(0)
+    x = generator.normal(size=60)
+    y = np.round(x + generator.normal(size=60), 1)  # with ties
+    rho, low, high = experiments.rank_correlation(x, y)
+    assert rho == pytest.approx(spearmanr(x, y).statistic)
+    assert low < rho < high
+    assert experiments.rank_correlation(x, np.exp(x))[0] == pytest.approx(1)
+    assert np.isnan(experiments.rank_correlation(x, np.ones(60))[0])
+    with pytest.raises(ValueError, match="three or more"):
+        experiments.rank_correlation([1, 2], [1, 2])
