@@ -44,6 +44,7 @@ from shapebody.networks import (
 )
 from shapebody.paths import data_dir
 from shapebody.robots import load_robot
+from shapebody.runtime import keep_memory
 
 
 @dataclass(frozen=True)
@@ -415,6 +416,7 @@ class Trainer:
     """
 
     def __init__(self, config: TrainConfig, folder=None, engine: str = "auto", policy=None):
+        keep_memory()
         self.config = config
         self.folder = Path(folder) if folder else data_dir() / "checkpoints" / config.name
         robots = [load_robot(name) for name in config.robots]
