@@ -1,0 +1,217 @@
+"""Checkers of the exercises in the notebooks.
+
+Each takes an answer and prints either "Right" with a sentence about why, or a hint. An answer of
+None means "not tried yet". Answers that are functions may be called with any valid input.
+"""
+
+import numpy as np
+
+
+def _waiting(answer, task: str) -> bool:
+    if answer is None:
+        print(f"Not answered yet: {task}")
+        return True
+    return False
+
+
+def _say(right: bool, praise: str, hint: str) -> None:
+    print(f"Right. {praise}" if right else f"Not yet. {hint}")
+
+
+def _number(answer) -> float | None:
+    try:
+        value = float(answer)
+    except (TypeError, ValueError):
+        value = np.nan
+    if not np.isfinite(value):
+        print(f"Not yet. The answer is {answer!r}; it should be one number.")
+        return None
+    return value
+
+
+# ------------------------------------------------------------------ 00 quickstart
+
+
+def check_trust_regions(results) -> None:
+    """Exercise: VGDS from one start with λ = 0, 20 and 100.
+
+    results: {λ: SearchResult}.
+    """
+    if _waiting(results, "put the three results into a dictionary {0: ..., 20: ..., 100: ...}."):
+        return
+    if not isinstance(results, dict) or set(results) != {0, 20, 100}:
+        print("Not yet. Expected a dictionary with the keys 0, 20 and 100.")
+        return
+    for trust_region, result in results.items():
+        used = result.settings["trust_region"]
+        if result.method != "vgds" or used != trust_region:
+            print(
+                f"Not yet. The result under {trust_region} is of method {result.method!r} with "
+                f"trust_region={used:g}; call search('vgds', ..., trust_region={trust_region})."
+            )
+            return
+    starts = [np.asarray(result.trajectory)[0] for result in results.values()]
+    if any(not np.array_equal(starts[0], start) for start in starts[1:]):
+        print("Not yet. The searches began at different designs; use one start for all three.")
+        return
+    distance = {key: float(np.sqrt(np.mean(results[key].design ** 2))) for key in (0, 20, 100)}
+    listing = ", ".join(f"{value:.3f} at λ = {key}" for key, value in distance.items())
+    _say(
+        distance[0] >= distance[20] >= distance[100],
+        f"The distance |f| / √d from the reference is {listing}: the larger λ, the closer.",
+        f"The distance |f| / √d is {listing}. It should fall with λ; did you pass other settings?",
+    )
+
+
+def check_largest_step(answer, result) -> None:
+    """Exercise: the largest change of one design parameter in one iteration of a search."""
+    if _waiting(answer, "the largest change of any parameter between two rows of the trajectory."):
+        return
+    answer = _number(answer)
+    if answer is None:
+        return
+    largest = float(np.abs(np.diff(result.trajectory, axis=0)).max())
+    if abs(answer - np.abs(result.trajectory[-1] - result.trajectory[0]).max()) < 1e-4:
+        print("Not yet. That is the change over the whole search; look at single iterations.")
+        return
+    limit = result.settings["max_update"]
+    _say(
+        abs(answer - largest) < 1e-3,
+        f"It is {largest:.4f}, while δ_max = {limit:g} would allow more: Adam's own step is about "
+        f"its learning rate {result.settings['learning_rate']:g}.",
+        "Take differences of neighbouring rows with np.diff(..., axis=0), then the largest "
+        "magnitude.",
+    )
+
+
+# ------------------------------------------------------------------ 01 robots and designs
+
+
+def check_total_mass(function, space) -> None:
+    """Exercise: total mass in kg of the design whose three size entries are x, all others 0.
+
+    function: x -> kg, without calling Φ.
+    """
+    if _waiting(function, "write a function of x and hand the function over, not a number."):
+        return
+    if not callable(function):
+        print("Not yet. Hand over the function itself, without calling it.")
+        return
+    xs = np.array([-1.0, -0.4, 0.0, 0.3, 1.0], np.float32)
+    designs = np.zeros((len(xs), space.dim), np.float32)
+    designs[:, space.slices["size"]] = xs[:, None]
+    true = np.asarray(space(designs).body_mass).sum(-1)
+    for x, expected in zip(xs, true, strict=True):
+        given = _number(function(float(x)))
+        if given is None:
+            return
+        if abs(given - expected) > 1e-3 * expected:
+            linear = abs(given - true[2] * (1 + 0.8 * x)) < 1e-3 * abs(given)
+            hint = "A body grows in three directions, so its mass grows with a³." if linear else ""
+            print(
+                f"Not yet. At x = {x:g} the robot weighs {expected:.3f} kg and the function says "
+                f"{given:.3f}. {hint}".rstrip()
+            )
+            return
+    _say(True, f"From {true[0]:.2f} kg at x = -1 to {true[-1]:.1f} kg at x = 1.", "")
+
+
+def check_heavier(f, space, kilograms: float = 1.0) -> None:
+    """Exercise: the design nearest to the reference that is `kilograms` heavier."""
+    if _waiting(f, "use the gradient of the total mass at the reference, and a step along it."):
+        return
+    try:
+        f = space.validate(f)
+    except ValueError as error:
+        print(f"Not yet. {error}")
+        return
+    if f.ndim != 1:
+        print(f"Not yet. Expected one design [{space.dim}], got shape {f.shape}.")
+        return
+    import jax
+
+    def mass(design):
+        return space(design).body_mass.sum()
+
+    gradient = np.asarray(jax.grad(mass)(space.reference))
+    gained = float(mass(f) - mass(space.reference))
+    # To first order, the shortest step is along the gradient.
+    shortest = kilograms / np.linalg.norm(gradient)
+    length = float(np.linalg.norm(f))
+    if abs(gained - kilograms) > 0.02 * kilograms:
+        print(
+            f"Not yet. The design is {gained:+.3f} kg off the reference instead of "
+            f"{kilograms:+g}. Φ is not linear: correct the step, or take several small ones."
+        )
+        return
+    _say(
+        length <= 1.05 * shortest,
+        f"{gained:+.3f} kg with |f| = {length:.4f}; a straight line of that gradient needs "
+        f"{shortest:.4f}.",
+        f"The mass is right, but |f| = {length:.4f} is far from the shortest, {shortest:.4f}. "
+        "Move along the gradient and leave everything else at 0.",
+    )
+
+
+# ------------------------------------------------------------------ 02 locomotion task
+
+
+def check_reward(function) -> None:
+    """Exercise: the reward of one step from its 23 terms.
+
+    function: (terms [23], unweighted; coefficient c) -> reward.
+    """
+    if _waiting(function, "write a function (terms, c) and hand the function over."):
+        return
+    if not callable(function):
+        print("Not yet. Hand over the function itself, without calling it.")
+        return
+    from shapebody.locomotion.rewards import combine
+
+    generator = np.random.default_rng(0)
+    for trial in range(20):
+        terms = np.concatenate(
+            [generator.uniform(0, 1, 2), [1, 1], -generator.exponential(1.0, 19)]
+        )
+        # The first trials are gentle, so that the clipping does not hide the sum.
+        terms[4:] *= 1e-3 if trial < 10 else 1.0
+        c = float(generator.uniform(0.05, 1)) if trial % 10 else float(trial // 10)
+        expected = float(combine(terms.astype(np.float32), c))
+        given = _number(function(terms.copy(), c))
+        if given is None:
+            return
+        if abs(given - expected) < 1e-4:
+            continue
+        if abs(given * 0.02 - expected) < 1e-4:
+            hint = "All weights are multiplied by the control step of 0.02 s."
+        elif given < 0:
+            hint = "The reward is never negative: one part of the sum is clipped at 0."
+        elif trial >= 10:
+            hint = "T4 is added after the clipping, so that being alive always pays."
+        else:
+            hint = "T1 and T2 count in full; T3 to T23 are multiplied by c."
+        print(f"Not yet. At c = {c:.2f} the reward is {expected:.5f}, not {given:.5f}. {hint}")
+        return
+    _say(True, "The function agrees with the task on 20 random steps.", "")
+
+
+def check_successes(answer, levels: int = 100) -> None:
+    """Exercise: successes in a row that raise the curriculum coefficient from 0 to 1."""
+    if _waiting(answer, "the number of successful episodes in a row."):
+        return
+    answer = _number(answer)
+    if answer is None:
+        return
+    needed = next(n for n in range(1, levels + 1) if n * (n + 1) // 2 >= levels)
+    if answer == levels:
+        print(
+            f"Not yet. That would be right if every success added 1/{levels}; "
+            "the k-th success in a row adds k times as much."
+        )
+        return
+    _say(
+        answer == needed,
+        f"1 + 2 + … + {needed} = {needed * (needed + 1) // 2} ≥ {levels}.",
+        "Find the smallest n with 1 + 2 + … + n at least "
+        f"{levels}. A streak starts at 1 with the first success.",
+    )

@@ -1,0 +1,128 @@
+"""The checkers accept right answers, and give hints for wrong ones."""
+
+from types import SimpleNamespace
+
+import jax
+import numpy as np
+import pytest
+
+from shapebody import exercises
+from shapebody.design import DesignSpace
+from shapebody.locomotion.rewards import TERMS
+from shapebody.robots import load_robot
+
+
+@pytest.fixture(scope="module")
+def space():
+    return DesignSpace(load_robot("unitree_go2"))
+
+
+def said(capsys):
+    return capsys.readouterr().out.strip()
+
+
+def result(trust_region, distance, start=0.5, method="vgds"):
+    trajectory = np.linspace(np.full(4, start), np.full(4, distance), 11).astype(np.float32)
+    settings = {"trust_region": float(trust_region), "max_update": 0.1, "learning_rate": 0.05}
+    return SimpleNamespace(
+        trajectory=trajectory, design=trajectory[-1], method=method, settings=settings
+    )
+
+
+@pytest.mark.parametrize(
+    "check, arguments",
+    [
+        (exercises.check_trust_regions, ()),
+        (exercises.check_largest_step, (None,)),
+        (exercises.check_total_mass, (None,)),
+        (exercises.check_heavier, (None,)),
+        (exercises.check_reward, ()),
+        (exercises.check_successes, ()),
+    ],
+)
+def test_unanswered(check, arguments, capsys):
+    check(None, *arguments)
+    assert said(capsys).startswith("Not answered yet")
+
+
+def test_trust_regions(capsys):
+    good = {0: result(0, 0.4), 20: result(20, 0.2), 100: result(100, 0.1)}
+    exercises.check_trust_regions(good)
+    assert said(capsys).startswith("Right")
+    wrong = (
+        {0: good[0]},
+        good | {20: good[0]},
+        good | {20: result(20, 0.2, method="penalty-only")},
+        good | {20: result(20, 0.2, start=0.6)},
+        good | {100: result(100, 0.45)},
+    )
+    for answer in wrong:
+        exercises.check_trust_regions(answer)
+        assert said(capsys).startswith("Not yet")
+
+
+def test_largest_step(capsys):
+    one = result(100, 0.1)
+    exercises.check_largest_step(0.04, one)
+    assert said(capsys).startswith("Right")
+    for answer in (0.4, 0.05, "much", np.nan):
+        exercises.check_largest_step(answer, one)
+        assert said(capsys).startswith("Not yet")
+
+
+def test_total_mass(space, capsys):
+    mass = space.robot.model.body_mass.sum()
+    exercises.check_total_mass(lambda x: mass * (1 + 0.8 * x) ** 3, space)
+    assert said(capsys).startswith("Right")
+    exercises.check_total_mass(lambda x: mass * (1 + 0.8 * x), space)
+    assert "three directions" in said(capsys)
+    for answer in (mass, lambda x: None, lambda x: 1.0):
+        exercises.check_total_mass(answer, space)
+        assert said(capsys).startswith("Not yet")
+
+
+def test_heavier(space, capsys):
+    def mass(f):
+        return space(f).body_mass.sum()
+
+    f, target = space.reference, float(mass(space.reference)) + 1
+    for _ in range(5):
+        gradient = np.asarray(jax.grad(mass)(f))
+        f = f + (target - float(mass(f))) * gradient / (gradient @ gradient)
+    exercises.check_heavier(f, space)
+    assert said(capsys).startswith("Right")
+    long_way = f.copy()
+    long_way[space.slices["range"]] = 0.5
+    for answer in (space.reference, long_way, f[:5], 2 + f, np.stack([f, f])):
+        exercises.check_heavier(answer, space)
+        assert said(capsys).startswith("Not yet")
+
+
+def test_reward(capsys):
+    weights = np.array([term.weight for term in TERMS]) * 0.02
+
+    def reward(terms, c):
+        weighted = weights * terms
+        inner = weighted[:2].sum() + c * (weighted[2] + weighted[4:].sum())
+        return max(inner, 0) + c * weighted[3]
+
+    exercises.check_reward(reward)
+    assert said(capsys).startswith("Right")
+    wrong = (
+        lambda terms, c: reward(terms, c) / 0.02,
+        lambda terms, c: weights @ terms,
+        lambda terms, c: max(weights[:2] @ terms[:2] + c * (weights[2:] @ terms[2:]), 0),
+        lambda terms, c: "high",
+        3.0,
+    )
+    for answer in wrong:
+        exercises.check_reward(answer)
+        assert said(capsys).startswith("Not yet")
+
+
+def test_successes(capsys):
+    exercises.check_successes(14)
+    assert said(capsys).startswith("Right")
+    for answer in (100, 10, 15, "many"):
+        exercises.check_successes(answer)
+        assert said(capsys).startswith("Not yet")
