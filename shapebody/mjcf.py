@@ -37,7 +37,7 @@ def build_model(robot: Robot, embodiment, scale) -> mujoco.MjModel:
     """A copy of the robot's model with all fields of one embodiment.
 
     `scale` [3] are the size factors (s_x, s_y, s_z), for what is only looked at: sites (size by
-    their mean), cameras and lights on the robot. The home keyframe gets the nominal pose with the
+    their mean) and cameras on the robot. The home keyframe gets the nominal pose with the
     lowest foot point on the floor, the custom entries the action scale and the velocity limits.
     """
     model = copy.copy(robot.model)
@@ -49,10 +49,8 @@ def build_model(robot: Robot, embodiment, scale) -> mujoco.MjModel:
     model.site_sameframe[:] = 0
     scale = np.asarray(scale, np.float64)
     model.site_size[model.site_bodyid > 0] *= scale.mean()
-    for kind in ("cam", "light"):
-        on_robot = getattr(model, f"{kind}_bodyid") > 0
-        for field in ("pos", "pos0", "poscom0"):
-            getattr(model, f"{kind}_{field}")[on_robot] *= scale
+    for field in ("cam_pos", "cam_pos0", "cam_poscom0"):
+        getattr(model, field)[model.cam_bodyid > 0] *= scale
     set_numeric(model, "action_scale", embodiment.action_scale)
     set_numeric(model, "velocity_limits", embodiment.velocity_limits)
     nominal = np.asarray(embodiment.nominal, np.float64)
@@ -110,16 +108,16 @@ def write_mjcf(robot: Robot, embodiment, scale) -> str:
     The text says in a comment what MJCF could not take over: inertias that violate the triangle
     inequality are balanced (`balanced`) and crossed joint limits are tightened (`ordered_ranges`).
     Compiling also recomputes MuJoCo's derived constants, which a design otherwise keeps from the
-    reference. Numbers have nine digits, which is more than float32. Meshes keep their size.
+    reference. Meshes keep their size.
     Raises ValueError if the text does not compile to the design, which a MJCF of the robot with
     features that move its parts (such as fusestatic) can cause.
     """
     design = build_model(robot, embodiment, scale)
-    fields = {name: _rounded(value) for name, value in model_fields(embodiment).items()}
+    fields = model_fields(embodiment)
     inertia = balanced(fields["body_inertia"])
     ranges = fields["jnt_range"].copy()
     hinges = robot.joints
-    ranges[hinges] = _rounded(ordered_ranges(ranges[hinges]))
+    ranges[hinges] = ordered_ranges(ranges[hinges])
     num_balanced = int(np.sum(np.any(inertia != fields["body_inertia"], axis=1)))
     num_tightened = int(np.sum(np.any(ranges != fields["jnt_range"], axis=1)))
     fields |= {"body_inertia": inertia, "jnt_range": ranges}
@@ -251,14 +249,9 @@ def _unframed(element) -> Iterator:
             yield child
 
 
-def _rounded(values) -> np.ndarray:
-    """The numbers that `_text` writes."""
-    values = np.asarray(values, np.float64)
-    return np.array([float(f"{x:.9g}") for x in values.ravel()]).reshape(values.shape)
-
-
 def _text(values) -> str:
-    return " ".join(f"{x:.9g}" for x in np.ravel(values))
+    """Shortest decimals that read back as the same float64."""
+    return " ".join(repr(float(x)).removesuffix(".0") for x in np.ravel(values))
 
 
 def _check(text: str, fields: dict[str, np.ndarray], robot: Robot) -> None:
