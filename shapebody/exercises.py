@@ -215,3 +215,152 @@ def check_successes(answer, levels: int = 100) -> None:
         "Find the smallest n with 1 + 2 + … + n at least "
         f"{levels}. A streak starts at 1 with the first success.",
     )
+
+
+# ------------------------------------------------------------------ 03 training
+
+
+def check_gae(function) -> None:
+    """Exercise: generalized advantage estimation of one episode that does not end.
+
+    function: (reward [T], value [T], last_value, discount, gae_lambda) -> advantages [T].
+    """
+    if _waiting(function, "write the function and hand it over."):
+        return
+    if not callable(function):
+        print("Not yet. Hand over the function itself, without calling it.")
+        return
+    import jax.numpy as jnp
+
+    from shapebody.ppo import advantages
+
+    generator = np.random.default_rng(0)
+    for steps, discount, gae_lambda in (
+        (1, 0.9, 0.5),
+        (6, 0.9, 0.0),
+        (6, 0.9, 1.0),
+        (9, 0.99, 0.7),
+    ):
+        reward, value = generator.normal(size=(2, steps)).astype(np.float32)
+        last = np.float32(generator.normal())
+        given = function(reward.copy(), value.copy(), float(last), discount, gae_lambda)
+        if given is None:
+            print("Not answered yet: the function returns None.")
+            return
+        never = jnp.zeros((1, steps), bool)
+        arguments = (jnp.asarray(x)[None] for x in (reward, value))
+        expected = advantages(
+            *arguments, jnp.asarray(last)[None], never, never, discount, gae_lambda
+        )
+        expected = np.asarray(expected)[0]
+        given = np.asarray(given, float)
+        if given.shape != expected.shape:
+            print(f"Not yet. Expected one number per step, {expected.shape}, got {given.shape}.")
+            return
+        if np.abs(given - expected).max() < 1e-4:
+            continue
+        error = reward + discount * np.append(value[1:], last) - value
+        if abs(given[-1] - error[-1]) > 1e-4:
+            hint = "After the last step comes last_value."
+        elif np.abs(given - error).max() < 1e-4:
+            hint = "These are the one-step errors; add the discounted advantage of the next step."
+        else:
+            hint = "Go backwards: A_t = δ_t + γ λ A_{t+1}."
+        print(f"Not yet. At γ = {discount:g} and λ = {gae_lambda:g} the numbers differ. {hint}")
+        return
+    _say(True, "The function agrees with the one that trains the agent.", "")
+
+
+def check_surrogate(function, clip_range: float = 0.1) -> None:
+    """Exercise: the clipped surrogate of PPO. function: (ratio, advantage) -> gain, arrays."""
+    if _waiting(function, "write the function and hand it over."):
+        return
+    if not callable(function):
+        print("Not yet. Hand over the function itself, without calling it.")
+        return
+    ratio, advantage = (
+        x.ravel() for x in np.meshgrid([0.5, 0.95, 1.0, 1.05, 1.5], [-2.0, -1.0, 0.0, 1.0, 2.0])
+    )
+    given = function(ratio.copy(), advantage.copy())
+    if given is None:
+        print("Not answered yet: the function returns None.")
+        return
+    clipped = np.clip(ratio, 1 - clip_range, 1 + clip_range)
+    expected = np.minimum(ratio * advantage, clipped * advantage)
+    given = np.asarray(given, float)
+    if given.shape != expected.shape:
+        print(f"Not yet. Expected an array of shape {expected.shape}, got {given.shape}.")
+        return
+    wrong = np.flatnonzero(np.abs(given - expected) > 1e-6)
+    if len(wrong) == 0:
+        _say(True, "The gain is never above the unclipped one: a pessimistic estimate.", "")
+    elif np.abs(given - clipped * advantage).max() < 1e-6:
+        print("Not yet. Clipping alone would stop the correction of a step that went wrong.")
+    else:
+        i = wrong[0]
+        print(
+            f"Not yet. At ratio {ratio[i]:g} and advantage {advantage[i]:g} the gain is "
+            f"{expected[i]:g}, not {given[i]:g}."
+        )
+
+
+# ------------------------------------------------------------------ 04 value-gradient design
+
+
+def check_step(function, max_update: float = 0.1) -> None:
+    """Exercise: the two clips of eq. (7). function: (f [d], Adam's step [d]) -> next design [d]."""
+    if _waiting(function, "write the function and hand it over."):
+        return
+    if not callable(function):
+        print("Not yet. Hand over the function itself, without calling it.")
+        return
+    f = np.array([0.0, 0.0, 0.0, 0.95, -0.95, 0.98, 1.0])
+    step = np.array([0.05, 0.3, -0.3, 0.04, -0.4, -0.5, -0.02])
+    given = function(f.copy(), step.copy())
+    if given is None:
+        print("Not answered yet: the function returns None.")
+        return
+    given = np.asarray(given, float)
+    expected = np.clip(f + np.clip(step, -max_update, max_update), -1, 1)
+    if given.shape != expected.shape:
+        print(f"Not yet. Expected a design of shape {expected.shape}, got {given.shape}.")
+        return
+    if np.abs(given).max() > 1 + 1e-6:
+        hint = "An entry leaves [-1, 1]; the outer clip keeps the design in its box."
+    elif np.abs(given - f).max() > max_update + 1e-6:
+        hint = f"An entry moves by more than δ_max = {max_update:g}; the inner clip comes first."
+    else:
+        hint = f"For f = {f} and steps {step} the next design is {expected}."
+    _say(np.abs(given - expected).max() < 1e-6, "Both clips are in their places.", hint)
+
+
+def check_radius(function, dim: int = 358) -> None:
+    """Exercise: how far a value gradient can pull one entry from the reference.
+
+    function: (one entry g of the value gradient, λ) -> |f - f_ref| where it balances the penalty.
+    """
+    if _waiting(function, "write a function (g, λ) and hand it over."):
+        return
+    if not callable(function):
+        print("Not yet. Hand over the function itself, without calling it.")
+        return
+    for g, trust_region in ((0.1, 20.0), (-0.1, 100.0), (0.02, 50.0), (5.0, 20.0)):
+        given = function(g, trust_region)
+        if given is None:
+            print("Not answered yet: the function returns None.")
+            return
+        given = _number(given)
+        if given is None:
+            return
+        balance = dim * abs(g) / (2 * trust_region)
+        if abs(given - min(balance, 1.0)) < 1e-3:
+            continue
+        if abs(given - balance) < 1e-3:
+            hint = "No entry can leave the box, so the distance from f = 0 is at most 1."
+        elif abs(abs(given) - 2 * min(balance, 1.0)) < 1e-3:
+            hint = "The derivative of a square brings a factor of 2."
+        else:
+            hint = "Set the derivative of the penalty, 2 λ (f - f_ref) / d, equal to g."
+        print(f"Not yet. For g = {g:g} and λ = {trust_region:g}: {hint}")
+        return
+    _say(True, f"With d = {dim}, larger λ means a proportionally smaller distance.", "")

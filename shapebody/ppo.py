@@ -515,13 +515,14 @@ class Trainer:
         key = jax.random.fold_in(self.key, 2 * number)
         return self.env.rollout(self.act, behaviour, state, key, self.config.rollout_length)
 
-    def run(self, max_steps=None, max_seconds=None, progress=True) -> None:
+    def run(self, max_steps=None, max_seconds=None, progress=True, curve_interval=None) -> None:
         """Train until the configured number of steps, or until a budget is used up.
 
         Args:
             max_steps: stop once this many steps in all have been consumed.
             max_seconds: stop after this many seconds of this call.
             progress: print a line every few seconds.
+            curve_interval: iterations per row of the learning curve, CURVE_INTERVAL if not given.
         """
         config = self.config
         last = min(config.iterations, (max_steps or config.total_steps) // config.batch)
@@ -554,7 +555,7 @@ class Trainer:
                 now = time.monotonic()
                 self.seconds, elapsed, mark = self.seconds + now - mark, now - mark, now
                 curve.add(trajectory, metrics, elapsed, config.batch)
-                if number % CURVE_INTERVAL == 0:
+                if number % (curve_interval or CURVE_INTERVAL) == 0:
                     curve.write(self.steps, self.seconds)
                 report.show(self.steps, curve)
                 self.save()

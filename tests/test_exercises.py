@@ -126,3 +126,70 @@ def test_successes(capsys):
     for answer in (100, 10, 15, "many"):
         exercises.check_successes(answer)
         assert said(capsys).startswith("Not yet")
+
+
+def gae(reward, value, last, discount, gae_lambda, steps_back=True, bootstrap=True):
+    following = np.append(value[1:], last if bootstrap else 0)
+    error = reward + discount * following - value
+    for t in range(len(error) - 2, -1, -1):
+        error[t] += steps_back * discount * gae_lambda * error[t + 1]
+    return error
+
+
+def test_gae(capsys):
+    exercises.check_gae(gae)
+    assert said(capsys).startswith("Right")
+    wrong = (
+        lambda *arguments: gae(*arguments, steps_back=False),
+        lambda *arguments: gae(*arguments, bootstrap=False),
+        lambda *arguments: gae(*arguments)[:-1],
+        lambda reward, *_: reward,
+        1.0,
+    )
+    for answer in wrong:
+        exercises.check_gae(answer)
+        assert said(capsys).startswith("Not yet")
+
+
+def test_surrogate(capsys):
+    exercises.check_surrogate(lambda r, a: np.minimum(r * a, np.clip(r, 0.9, 1.1) * a))
+    assert said(capsys).startswith("Right")
+    for answer in (lambda r, a: np.clip(r, 0.9, 1.1) * a, lambda r, a: r * a, lambda r, a: a[0]):
+        exercises.check_surrogate(answer)
+        assert said(capsys).startswith("Not yet")
+
+
+def test_step(capsys):
+    exercises.check_step(lambda f, step: np.clip(f + np.clip(step, -0.1, 0.1), -1, 1))
+    assert said(capsys).startswith("Right")
+    wrong = (
+        lambda f, step: f + np.clip(step, -0.1, 0.1),
+        lambda f, step: np.clip(f + step, -1, 1),
+        lambda f, step: f,
+        lambda f, step: f[0],
+    )
+    for answer in wrong:
+        exercises.check_step(answer)
+        assert said(capsys).startswith("Not yet")
+
+
+def test_radius(capsys):
+    exercises.check_radius(lambda g, trust_region: min(358 * abs(g) / (2 * trust_region), 1))
+    assert said(capsys).startswith("Right")
+    wrong = (
+        lambda g, trust_region: 358 * abs(g) / (2 * trust_region),
+        lambda g, trust_region: min(358 * abs(g) / trust_region, 1),
+        lambda g, trust_region: g,
+        lambda g, trust_region: "far",
+    )
+    for answer in wrong:
+        exercises.check_radius(answer)
+        assert said(capsys).startswith("Not yet")
+
+
+def test_untried_exercises_are_no_errors(capsys):
+    names = ("check_gae", "check_surrogate", "check_step", "check_radius")
+    for check in (getattr(exercises, name) for name in names):
+        for answer in (None, lambda *_: None):
+            check(answer)
+            assert said(capsys).startswith("Not answered yet")
