@@ -176,50 +176,50 @@ def _tree(robot: Robot):
     """
     model = robot.model
     body, joint, parent, of_body, of_joint = _plan(robot)
+    body, joint = body.ravel(), joint.ravel()
     address = model.jnt_qposadr[joint]
     turned = (0.5 * (joint > 0)).astype(np.float32)
     qpos0 = np.asarray(model.qpos0, np.float32)[address]
 
-    def step(carry, level):
-        quat, pos = carry
-        parent, offset, offset_quat, local, axis, half = level
+    def step(above, level):
+        quat, pos = above
+        parent, local_quat, local_pos = level
         quat, pos = quat[:, parent], pos[:, parent]
-        pos = pos + _rotate(_matrix(quat), offset)
-        quat = _multiply(quat, offset_quat)
-        anchor = pos + _rotate(_matrix(quat), local)
-        quat = _multiply(quat, jnp.concatenate([jnp.cos(half)[None], jnp.sin(half) * axis]))
-        rot = _matrix(quat)
-        pos = anchor - _rotate(rot, local)
-        return (quat, pos), (pos, rot, anchor, _rotate(rot, axis))
+        pos = pos + _rotate(_matrix(quat), local_pos)
+        quat = _multiply(quat, local_quat)
+        return (quat, pos), (quat, pos)
 
     def forward(e: Embodiment, qpos):
-        def stacked(rows, index):
-            return jnp.moveaxis(rows[index], -1, 1)
+        # All nodes at once: their frames in the frame of their parent.
+        offset, offset_quat = e.body_pos[body].T, e.body_quat[body].T
+        center, axis = e.jnt_pos[joint].T, e.jnt_axis[joint].T
+        half = turned * (qpos[address] - qpos0)
+        local_quat = _multiply(
+            offset_quat, jnp.concatenate([jnp.cos(half)[None], jnp.sin(half) * axis])
+        )
+        local_pos = offset + _rotate(_matrix(offset_quat), center)
+        local_pos = local_pos - _rotate(_matrix(local_quat), center)
 
-        quat = qpos[3:7, None]
-        quat = quat / jnp.sqrt(jnp.sum(quat**2))
-        pos = qpos[:3, None]
-        levels = (
-            parent,
-            stacked(e.body_pos, body),
-            stacked(e.body_quat, body),
-            stacked(e.jnt_pos, joint),
-            stacked(e.jnt_axis, joint),
-            turned * (qpos[address] - qpos0),
-        )
-        width = parent.shape[1]
-        start = (jnp.broadcast_to(quat, (4, width)), jnp.broadcast_to(pos, (3, width)))
-        _, outputs = jax.lax.scan(step, start, levels)
-        below, rotations, anchors, axes = (
-            jnp.moveaxis(x, 0, -2).reshape(*x.shape[1:-1], -1) for x in outputs
-        )
-        world, identity = np.zeros((3, 1), np.float32), np.eye(3, dtype=np.float32)[..., None]
-        return (
-            jnp.concatenate([world, pos, below[:, of_body]], axis=-1),
-            jnp.concatenate([identity, _matrix(quat), rotations[..., of_body]], axis=-1),
-            anchors[:, of_joint],
-            axes[:, of_joint],
-        )
+        def by_level(rows):
+            return jnp.moveaxis(rows.reshape(-1, *parent.shape), 0, 1)
+
+        def flat(rows):
+            return jnp.moveaxis(rows, 0, 1).reshape(rows.shape[1], -1)
+
+        root_quat, root_pos = qpos[3:7, None], qpos[:3, None]
+        root_quat = root_quat / jnp.sqrt(jnp.sum(root_quat**2))
+        start = tuple(jnp.repeat(x, parent.shape[1], axis=1) for x in (root_quat, root_pos))
+        levels = parent, by_level(local_quat), by_level(local_pos)
+        _, (quat, pos) = jax.lax.scan(step, start, levels)
+
+        # All nodes at once again: their frames in the world.
+        quat, pos = flat(quat), flat(pos)
+        rot = _matrix(quat)
+        anchor = pos + _rotate(rot, center)
+        world = np.array([[1.0], [0], [0], [0]], np.float32)
+        quat = jnp.concatenate([world, root_quat, quat[:, of_body]], axis=-1)
+        pos = jnp.concatenate([world[1:], root_pos, pos[:, of_body]], axis=-1)
+        return pos, _matrix(quat), anchor[:, of_joint], _rotate(rot, axis)[:, of_joint]
 
     return forward
 

@@ -77,7 +77,7 @@ def described(spaces):
     return functions
 
 
-@pytest.mark.parametrize("name", (*ROBOTS, "mixed"))
+@pytest.mark.parametrize("name", ("unitree_go2", "mit_humanoid", "mixed"))
 def test_kinematics_agrees_with_mujoco(spaces, name):
     space = spaces[name]
     robot, model = space.robot, space.robot.model
@@ -265,8 +265,8 @@ def test_sizes(spaces):
         describe(robots[2], Sizes(joints=24, feet=4, spheres=99))
 
 
-@pytest.mark.parametrize("name", ("unitree_go2", "mit_humanoid"))
-def test_padding_changes_nothing(spaces, described, name):
+def test_padding_changes_nothing(spaces, described):
+    name = "mit_humanoid"
     space = spaces[name]
     own = Sizes.of(space.robot)
     larger = Sizes(own.joints + 3, own.feet + 2, own.spheres + 5)
@@ -289,12 +289,10 @@ def test_batches_agree_with_single_designs(spaces, described):
     function = described["unitree_go2"]
     designs = np.stack([space.start(seed) for seed in range(6)]).reshape(3, 2, -1)
     batch = function(designs)
-    mapped = jax.jit(jax.vmap(function))(designs[:, 0])
     single = function(designs[2, 0])
     for field in FIELDS:
-        expected = np.asarray(getattr(single, field))
-        for other in (np.asarray(getattr(batch, field))[2, 0], getattr(mapped, field)[2]):
-            np.testing.assert_allclose(other, expected, rtol=1e-5, atol=1e-6, err_msg=field)
+        entry, expected = getattr(batch, field)[2, 0], getattr(single, field)
+        np.testing.assert_allclose(entry, expected, rtol=1e-5, atol=1e-6, err_msg=field)
 
 
 @settings(max_examples=40, deadline=None)
@@ -326,9 +324,12 @@ def test_gradient_against_finite_differences(spaces, described):
         d = build(e)
         return sum(jnp.sum(weights[field] * getattr(d, field)) for field in fields)
 
+    differentiate = jax.jit(jax.grad(scalar))
+    for design in (space.reference, space.start(0)):
+        leaves = jax.tree.leaves(differentiate(space(design)))
+        assert all(np.all(np.isfinite(leaf)) for leaf in leaves)
     e = space(f)
-    gradient = jax.jit(jax.grad(scalar))(e)
-    assert all(np.all(np.isfinite(leaf)) for leaf in jax.tree.leaves(gradient))
+    gradient = differentiate(e)
 
     # Small enough a step that no other geom becomes the outermost one.
     step, model = 1e-5, space.to_model(f)
@@ -352,16 +353,3 @@ def test_gradient_against_finite_differences(spaces, described):
         expected = (values[0] - values[1]) / (2 * step)
         actual = np.sum(direction * np.asarray(getattr(gradient, field)))
         np.testing.assert_allclose(actual, expected, rtol=2e-3, atol=1e-3, err_msg=field)
-
-
-def test_gradient_is_finite_at_the_reference(spaces):
-    """Also through f, where quaternions are trivial and many moments and sizes are equal."""
-    space = spaces["unitree_go2"]
-    build = describe(space.robot)
-
-    def scalar(f):
-        return sum(jnp.sum(leaf) for leaf in jax.tree.leaves(build(space(f))))
-
-    gradient = jax.jit(jax.grad(scalar))
-    for f in (space.reference, space.start(0)):
-        assert np.all(np.isfinite(gradient(f)))
