@@ -14,8 +14,8 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
-from .design import Embodiment, soft_limits
-from .robots import Robot
+from shapebody.design import Embodiment, soft_limits
+from shapebody.robots import Robot
 
 JOINT_DESCRIPTION = 30
 FOOT_DESCRIPTION = 21
@@ -90,8 +90,8 @@ class Descriptions:
     total_mass: jax.Array  # [] kg
 
 
-# Inside this module vectors are [3, n], quaternions [4, n] and rotations [3, 3, n]: with components
-# first, everything is a sum of products of long rows, which XLA turns into fast loops.
+# Inside this module vectors are [3, n], quaternions [4, n] and rotations [3, 3, n]. With components
+# first, everything is a sum of products of rows, several times faster in XLA than small matrices.
 
 
 def _matrix(q):
@@ -134,12 +134,13 @@ def _take(rows, index):
 
 
 def _plan(robot: Robot):
-    """The tree below the trunk as levels of nodes: (body, joint, parent, last), int [L, W] each.
+    """The tree below the trunk as L levels of at most W nodes: (body, joint, parent, places...).
 
-    A node is one joint of a body, or a body without joint; its offset is that of `body`. World
-    (body 0, no offset) and free joint (joint 0, never turned) stand for "none" and for padding.
-    `parent` counts within the level above. Last, for bodies from 2 on and for hinge joints in id
-    order, the flat index of the node that holds their frame.
+    A node is one joint of a body, or a body without joint. `body`, `joint` and `parent` are int
+    [L, W]: whose offset it has, which joint turns it, and its parent within the level above. The
+    world (body 0, no offset) and the free joint (joint 0, never turned) stand for "none" and for
+    padding. The places are the flat indices of the nodes that hold the frames of the bodies from
+    2 on and of the hinge joints.
     """
     model = robot.model
     nodes, levels, of_body, of_joint = {1: (0, 0)}, [], {}, {}
@@ -313,7 +314,7 @@ def describe(robot: Robot, sizes: Sizes | None = None) -> Callable[[Embodiment],
     # One-hot rows put nominal positions into qpos without a scatter.
     place = np.zeros((robot.num_actuators, model.nq), np.float32)
     place[np.arange(robot.num_actuators), robot.qpos_index] = 1
-    passive = origin * (1 - place.sum(axis=0))
+    not_actuated = origin * (1 - place.sum(axis=0))
     num_joints, num_feet = robot.num_actuators, robot.num_feet
     above_diagonal = np.triu(np.ones((robot.num_spheres,) * 2, bool), k=1)
 
@@ -334,7 +335,7 @@ def describe(robot: Robot, sizes: Sizes | None = None) -> Callable[[Embodiment],
     def single(embodiment: Embodiment) -> Descriptions:
         e = embodiment
         # With the trunk at the origin, world coordinates are trunk coordinates.
-        qpos = passive + jnp.sum(place * e.nominal[:, None], axis=0)
+        qpos = not_actuated + jnp.sum(place * e.nominal[:, None], axis=0)
         pos, rot, anchor, axis = forward(e, qpos)
         com = pos + _rotate(rot, e.body_ipos.T)
 
@@ -394,8 +395,9 @@ def describe(robot: Robot, sizes: Sizes | None = None) -> Callable[[Embodiment],
             ]
         )
 
-        home_height = -jnp.min(up @ feet)
-        imu = pos[:, robot.trunk] + rot[..., robot.trunk] @ e.site_pos[robot.imu_site]
+        # Sums instead of products of matrices, which accelerators round to fewer digits.
+        home_height = -jnp.min(jnp.sum(up[:, None] * feet, axis=0))
+        imu_height = home_height + jnp.sum(up * e.site_pos[robot.imu_site])
         radius = size[0, : robot.num_spheres]
         distance2 = sum((row[:, None] - row[None]) ** 2 for row in spheres)
         touching = distance2 < (radius[:, None] + radius[None]) ** 2
@@ -418,7 +420,7 @@ def describe(robot: Robot, sizes: Sizes | None = None) -> Callable[[Embodiment],
             sphere_radius=padded(radius, sizes.spheres),
             sphere_mask=jnp.asarray(sphere_mask),
             home_height=home_height,
-            imu_height=home_height + up @ imu,
+            imu_height=imu_height,
             nominal_collisions=collisions,
             dimensions=dimensions,
             total_mass=total_mass,

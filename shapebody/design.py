@@ -16,8 +16,8 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
-from .mjcf import build_model, write_mjcf
-from .robots import Robot
+from shapebody.mjcf import build_model, write_mjcf
+from shapebody.robots import Robot
 
 SOFT_LIMIT = 0.9  # soft limits span this fraction of a joint's range, about its midpoint
 
@@ -234,6 +234,12 @@ class DesignSpace:
 
     `space(f)` maps float32 f [..., d] to an `Embodiment` with the same leading axes, and can be
     jitted, vmapped and differentiated. It checks the length of f only; `validate` checks values.
+
+    Φ clips damping, armature, stiffness and friction loss at 0 and nominal positions to the soft
+    limits of the reference joint ranges (also at f = 0), and nothing else: principal inertias
+    mostly violate the triangle inequality, a joint's range may exclude its nominal position, and
+    narrow ranges may have lower > upper. Physics takes all of that as it is; for MJCF see
+    `to_mjcf`.
     """
 
     def __init__(self, robot: Robot, axes_seed: int = 0, published_axes_of=None):

@@ -10,7 +10,7 @@ from collections.abc import Iterator
 import mujoco
 import numpy as np
 
-from .robots import FOOT_BOX, Robot
+from shapebody.robots import FOOT_BOX, Robot
 
 TIGHT_RANGE = 0.001  # rad, half width of the exported range of a joint whose limits have crossed
 _SIZES = {
@@ -94,8 +94,14 @@ def balanced(inertia) -> np.ndarray:
 
 
 def ordered_ranges(ranges) -> np.ndarray:
-    """Joint ranges [n, 2] with lower < upper: crossed limits become a tight range about their
-    midpoint, where the two limits would hold the joint."""
+    """Joint ranges [n, 2] with lower < upper.
+
+    The design map can make the limits of a joint cross if its reference range is below 0.8 rad (no
+    joint of Go2, MIT Humanoid or Golem, but e.g. ankles of small humanoids). C MuJoCo then applies
+    both limits, MJX only the more violated one, and the MJCF compiler either rejects such a range
+    or silently drops it. Here it becomes a tight range about the midpoint, where the two limits
+    hold the joint in C MuJoCo.
+    """
     crossed = ranges[:, 0] >= ranges[:, 1]
     middle = ranges.mean(axis=1, keepdims=True)
     tight = middle + np.array([-TIGHT_RANGE, TIGHT_RANGE])
