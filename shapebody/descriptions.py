@@ -14,7 +14,8 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
-from shapebody.design import Embodiment, soft_limits
+from shapebody.design import Embodiment, quaternion_product
+from shapebody.parameters import soft_limits
 from shapebody.robots import Robot
 
 JOINT_DESCRIPTION = 30
@@ -115,18 +116,6 @@ def _compose(first, second):
     return jnp.stack([_rotate(first, second[:, column]) for column in range(3)], axis=1)
 
 
-def _multiply(p, q):
-    """Quaternion products [4, n]."""
-    return jnp.stack(
-        [
-            p[0] * q[0] - p[1] * q[1] - p[2] * q[2] - p[3] * q[3],
-            p[0] * q[1] + p[1] * q[0] + p[2] * q[3] - p[3] * q[2],
-            p[0] * q[2] - p[1] * q[3] + p[2] * q[0] + p[3] * q[1],
-            p[0] * q[3] + p[1] * q[2] - p[2] * q[1] + p[3] * q[0],
-        ]
-    )
-
-
 def _take(rows, index):
     """Columns `index` (constant) of rows [..., n]."""
     index = np.asarray(index)
@@ -187,7 +176,7 @@ def _tree(robot: Robot):
         parent, local_quat, local_pos = level
         quat, pos = quat[:, parent], pos[:, parent]
         pos = pos + _rotate(_matrix(quat), local_pos)
-        quat = _multiply(quat, local_quat)
+        quat = quaternion_product(quat, local_quat)
         return (quat, pos), (quat, pos)
 
     def forward(e: Embodiment, qpos):
@@ -195,7 +184,7 @@ def _tree(robot: Robot):
         offset, offset_quat = e.body_pos[body].T, e.body_quat[body].T
         center, axis = e.jnt_pos[joint].T, e.jnt_axis[joint].T
         half = turned * (qpos[address] - qpos0)
-        local_quat = _multiply(
+        local_quat = quaternion_product(
             offset_quat, jnp.concatenate([jnp.cos(half)[None], jnp.sin(half) * axis])
         )
         local_pos = offset + _rotate(_matrix(offset_quat), center)

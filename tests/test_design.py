@@ -12,16 +12,14 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
 from shapebody.design import (
-    BLOCKS,
-    KINDS,
     MODEL_FIELDS,
     DesignSpace,
     Embodiment,
-    part_label,
     published_axes,
     published_axes_seed,
 )
 from shapebody.mjcf import TIGHT_RANGE, balanced, ordered_ranges
+from shapebody.parameters import BLOCKS, KINDS, part_label
 from shapebody.robots import load_robot
 
 ROBOTS = ("unitree_go2", "mit_humanoid", "golem")
