@@ -145,3 +145,14 @@ def test_train_and_policy_evaluation(config, tmp_path):
         np.testing.assert_array_equal(a, b)
     assert sharper.critic_config.heads == 3
     assert np.all(np.asarray(sharper.states.privileged)[:, 4] == 1.0)
+
+
+@pytest.mark.slow
+def test_training_on_mjx_resumes(tmp_path):
+    config = ppo.TrainConfig.smoke("unitree_go2", num_envs=4, minibatch_size=32)
+    for steps in (32, 64):
+        trainer = ppo.Trainer(config, tmp_path, engine="mjx")
+        assert trainer.start() == (steps > 32)
+        trainer.run(max_steps=steps, progress=False)
+    assert trainer.steps == 64
+    assert all(np.isfinite(x).all() for x in leaves(trainer))
