@@ -218,7 +218,7 @@ def _run(env: Locomotion, agent: Agent, designs, keys, coefficient, report) -> _
             state, record, _ = env.step(policy, params, state, key)
             records = [record]
         else:
-            length = min(_CALLS, horizon - step)
+            length = min(_CALLS, horizon)
             state, trajectory = env.rollout(policy, params, state, key, length)
             records = _rows(trajectory, length)
         for record in records:

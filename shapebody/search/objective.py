@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import numbers
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any
@@ -106,7 +107,7 @@ class Objective:
             ValueError: for a λ that is negative or not finite, a wrong reference or batch size,
                 and an agent without states that fit the robot.
         """
-        if not (np.isscalar(trust_region) and np.isfinite(trust_region) and trust_region >= 0):
+        if not (isinstance(trust_region, numbers.Real) and 0 <= trust_region < np.inf):
             raise ValueError(
                 f"trust_region is {trust_region!r}; expected a finite number of at least 0 "
                 "(the penalty coefficient, 100 in the paper)"
