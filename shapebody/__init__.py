@@ -38,11 +38,13 @@ _MODULE_OF = {
     "EvaluationConfig": "evaluation",
     "evaluate": "evaluation",
     "scale": "experiments",
+    "Recording": "recording",
+    "record_episode": "recording",
     "start_notebook": "runtime",
 }
 
 # Modules that notebooks use as such: shapebody.video.show_video(...).
-_MODULES = ("explorer", "plots", "video")
+_MODULES = ("experiments", "explorer", "plots", "video")
 
 __all__ = sorted([*_MODULE_OF, *_MODULES])
 

@@ -312,12 +312,18 @@ def describe(robot: Robot, sizes: Sizes | None = None) -> Callable[[Embodiment],
         pad = [(0, length - values.shape[axis]) for axis in range(axes)]
         return jnp.pad(values, pad + [(0, 0)] * (values.ndim - axes))
 
-    joint_mask = np.asarray(padded(np.ones(num_joints), sizes.joints))
-    foot_mask = np.asarray(padded(np.ones(num_feet), sizes.feet))
-    sphere_mask = np.asarray(padded(np.ones(robot.num_spheres), sizes.spheres))
-    keep_nominal = np.asarray(padded(robot.keep_nominal, sizes.joints))
-    foot_is_box = np.asarray(padded(robot.foot_types, sizes.feet))
-    foot_pairs = np.asarray(padded(symmetric_feet(robot), sizes.feet, axes=2))
+    def constant(values, length, axes=1):
+        """`padded` for what does not depend on the design; NumPy, so that it works in a trace."""
+        values = np.asarray(values, np.float32)
+        pad = [(0, length - n) for n in values.shape[:axes]]
+        return np.pad(values, pad + [(0, 0)] * (values.ndim - axes))
+
+    joint_mask = constant(np.ones(num_joints), sizes.joints)
+    foot_mask = constant(np.ones(num_feet), sizes.feet)
+    sphere_mask = constant(np.ones(robot.num_spheres), sizes.spheres)
+    keep_nominal = constant(robot.keep_nominal, sizes.joints)
+    foot_is_box = constant(robot.foot_types, sizes.feet)
+    foot_pairs = constant(symmetric_feet(robot), sizes.feet, axes=2)
     foot_type = (2 * robot.foot_types[None] - 1).astype(np.float32)
     boxed_rot = _constant_rotations(model.geom_quat[boxed])
 

@@ -35,6 +35,9 @@ class EvaluationConfig:
     """Settings of the task."""
     num_envs: int = 512
     """Largest number of episodes that run side by side."""
+    recompute_constants: bool = False
+    """Native engine: recompute MuJoCo's derived constants for every design, instead of keeping
+    the reference's as the paper's environment does."""
 
     def __post_init__(self):
         for name in ("episodes", "num_envs"):
@@ -151,7 +154,7 @@ def evaluate(
     total = len(rows) * config.episodes
     chunks = -(-total // config.num_envs)
     size = -(-total // chunks)
-    env = _environment(robot, size, engine, config.task)
+    env = _environment(robot, size, engine, config.task, config.recompute_constants)
     keys = np.asarray(_episode_keys(seed, config.episodes))
     measured = []
     began = time.perf_counter()
@@ -273,8 +276,11 @@ def _embed(config: PolicyConfig):
 
 
 @functools.lru_cache(maxsize=4)
-def _environment(robot: Robot, num_envs: int, engine: str, task: TaskConfig) -> Locomotion:
-    return Locomotion(robot, num_envs, engine, task, auto_reset=False)
+def _environment(
+    robot: Robot, num_envs: int, engine: str, task: TaskConfig, recompute_constants: bool
+) -> Locomotion:
+    options = {"recompute_constants": True} if recompute_constants else None
+    return Locomotion(robot, num_envs, engine, task, auto_reset=False, physics_options=options)
 
 
 @functools.partial(jax.jit, static_argnums=1)

@@ -390,3 +390,61 @@ def scales_table() -> list[dict]:
             }
         )
     return rows
+
+
+def derived_constants(
+    agent, robot, starts: int = 10, episodes: int = 16, seed: int = 0
+) -> list[dict]:
+    """How much returns depend on MuJoCo's derived constants (`body_invweight0` and the like).
+
+    The paper's environment leaves them at the reference when a body changes, and so do we; the
+    native engine can recompute them for every design.
+
+    Returns:
+        One record per design (the reference, then the starts): mean return with the reference's
+        constants, with recomputed ones, and the standard error of their paired difference.
+    """
+    from shapebody.design import DesignSpace
+    from shapebody.evaluation import EvaluationConfig, evaluate
+
+    space = DesignSpace(robot)
+    designs = np.stack([space.reference] + [space.start(i) for i in range(starts)])
+    kept, recomputed = (
+        evaluate(
+            agent,
+            robot,
+            designs,
+            episodes=episodes,
+            seed=seed,
+            engine="native",
+            config=EvaluationConfig(recompute_constants=value),
+        ).returns
+        for value in (False, True)
+    )
+    difference = recomputed - kept
+    return [
+        {
+            "design": "reference" if i == 0 else f"start {i - 1}",
+            "return": float(kept[i].mean()),
+            "return_recomputed": float(recomputed[i].mean()),
+            "standard_error": float(difference[i].std(ddof=1) / np.sqrt(episodes)),
+        }
+        for i in range(len(designs))
+    ]
+
+
+def before_after(agent, robot, path, start: int = 0, trust_region: float = 20.0) -> None:
+    """Save a picture of a start design, the design VGDS finds from it, and the reference."""
+    from shapebody import video
+    from shapebody.design import DesignSpace
+    from shapebody.search import search
+
+    space = DesignSpace(robot)
+    f = space.start(start)
+    found = search("vgds", agent, robot, f, trust_region=trust_region).design
+    models = [space.to_model(x) for x in (f, found, space.reference)]
+    labels = [f"start design {start}", "found by VGDS", "reference"]
+    picture = video.body_grid(models, labels=labels, columns=3)
+    from PIL import Image
+
+    Image.fromarray(picture).save(path)

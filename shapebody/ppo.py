@@ -578,7 +578,7 @@ class Trainer:
         length = self.config.rollout_length
         parts, robots, per = [], [], -(-count // rollouts)
         owner = np.concatenate([np.full(g.count, i) for i, g in enumerate(env.groups)])
-        skip = max(1, 160 // length)
+        skip = max(1, 64 // length)
         rng = np.random.default_rng(self.config.seed)
         for r in range(rollouts):
             # Rollouts far apart, so that states come from many moments of an episode.
