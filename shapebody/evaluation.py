@@ -277,7 +277,11 @@ def _embed(config: PolicyConfig):
 
 @functools.lru_cache(maxsize=4)
 def _environment(
-    robot: Robot, num_envs: int, engine: str, task: TaskConfig, recompute_constants: bool
+    robot: Robot,
+    num_envs: int,
+    engine: str,
+    task: TaskConfig,
+    recompute_constants: bool = False,
 ) -> Locomotion:
     options = {"recompute_constants": True} if recompute_constants else None
     return Locomotion(robot, num_envs, engine, task, auto_reset=False, physics_options=options)
