@@ -25,7 +25,6 @@ def main(arguments=None) -> int:
         "sharpen", help="policy evaluation: a new critic for an agent's frozen policy"
     )
     sharpen.add_argument("agent")
-    sharpen.add_argument("--name", help="name of the new agent (default: <agent>_critic)")
     sharpen.add_argument("--steps", type=int, default=4_000_000)
     sharpen.add_argument("--hours", type=float)
 
@@ -79,7 +78,7 @@ def _sharpen(options):
 
     agent = load_agent(options.agent)
     seconds = None if options.hours is None else 3600 * options.hours
-    train_critic(agent, CriticConfig.sharp(), options.steps, name=options.name, max_seconds=seconds)
+    train_critic(agent, CriticConfig.sharp(), options.steps, max_seconds=seconds)
 
 
 def _design(options):

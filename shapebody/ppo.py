@@ -618,7 +618,10 @@ def train(
     """
     trainer = Trainer(config, folder, engine)
     trainer.start()
-    return _run_and_save(trainer, progress, max_steps, max_seconds)
+    _run(trainer, progress, max_steps, max_seconds)
+    agent = trainer.agent(trainer.state_bank())
+    save_agent(agent, trainer.folder)
+    return agent
 
 
 def train_critic(
@@ -626,7 +629,6 @@ def train_critic(
     critic: CriticConfig,
     steps: int = 4_000_000,
     folder=None,
-    name: str | None = None,
     progress: bool = True,
     max_seconds: float | None = None,
     engine: str = "auto",
@@ -635,19 +637,27 @@ def train_critic(
     """Policy evaluation: train a new critic for a frozen policy over the full design space.
 
     The agent's policy acts (with its exploration noise) on designs f ~ U([-1, 1]^d); the critic
-    learns its TD(lambda) returns. `changes` replace fields of the TrainConfig; by default
-    gae_lambda is 0.95.
+    learns its TD(lambda) returns.
+
+    Args:
+        agent: its policy is kept, its critic and state bank are replaced.
+        critic: sizes of the new critic.
+        steps: environment steps.
+        folder: where the new agent is saved; data/checkpoints/<agent> by default, which replaces
+            the old critic there. The phase's own state and curve are in a folder in it.
+        progress, max_seconds, engine: see `train`. A run that was stopped is continued.
+        changes: replace fields of the TrainConfig; by default gae_lambda is 0.95.
 
     Returns:
-        The agent with the new critic and a new state bank, saved in `folder`
-        (data/checkpoints/<name>, by default "<agent>_critic").
+        The agent with the new critic and a new state bank. Its metadata are those of the policy's
+        training, with those of this phase under "policy_evaluation".
     """
-    name = name or f"{agent.name}_critic"
+    folder = Path(folder) if folder else data_dir() / "checkpoints" / agent.name
     base = TrainConfig.at_scale(agent.metadata["scale"], agent.robots[0])
     config = replace(
         base,
         **{
-            "name": name,
+            "name": agent.name,
             "robots": agent.robots,
             "policy": agent.policy_config,
             "critic": critic,
@@ -658,21 +668,24 @@ def train_critic(
             **changes,
         },
     )
-    trainer = Trainer(config, folder, engine, policy=agent.policy)
+    # The state belongs to this policy: another one starts anew.
+    trainer = Trainer(config, folder / f"critic_{agent.hash[:8]}", engine, policy=agent.policy)
     trainer.start()
-    return _run_and_save(trainer, progress, None, max_seconds)
+    _run(trainer, progress, None, max_seconds)
+    sharper = trainer.agent(trainer.state_bank())
+    phase = {name: sharper.metadata[name] for name in ("config", "steps", "seconds")}
+    sharper = replace(sharper, metadata={**agent.metadata, "policy_evaluation": phase})
+    save_agent(sharper, folder)
+    return sharper
 
 
-def _run_and_save(trainer: Trainer, progress, max_steps, max_seconds) -> Agent:
+def _run(trainer: Trainer, progress, max_steps, max_seconds) -> None:
     try:
         trainer.run(max_steps, max_seconds, progress)
     except KeyboardInterrupt:
-        # The training state on disk is whole; the agent below is the learner's latest.
+        # The training state on disk is whole; the learner's latest weights are kept as well.
         if progress:
             print("\ninterrupted: saved, the same call continues", flush=True)
-    agent = trainer.agent(trainer.state_bank())
-    save_agent(agent, trainer.folder)
-    return agent
 
 
 class _Curve:

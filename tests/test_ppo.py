@@ -143,7 +143,8 @@ def test_train_and_policy_evaluation(config, tmp_path):
     sharper = ppo.train_critic(loaded, small, steps=256, folder=tmp_path / "b", progress=False)
     for a, b in zip(jax.tree.leaves(agent.policy), jax.tree.leaves(sharper.policy), strict=True):
         np.testing.assert_array_equal(a, b)
-    assert sharper.critic_config.heads == 3
+    assert sharper.critic_config.heads == 3 and sharper.metadata["steps"] == 128
+    assert sharper.metadata["policy_evaluation"]["steps"] == 256
     assert np.all(np.asarray(sharper.states.privileged)[:, 4] == 1.0)
 
 

@@ -1,0 +1,116 @@
+"""Files that are never half-written, and exact copies of training state. No pickle."""
+
+from __future__ import annotations
+
+import os
+import secrets
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import safetensors
+import safetensors.numpy
+
+
+def atomic_write(path: str | Path, data: bytes | str) -> Path:
+    """Write a file so that it is never seen half-written; its folder is created if needed."""
+    path = Path(path)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    if isinstance(data, str):
+        data = data.encode()
+    temporary = path.with_name(f".{path.name}.{secrets.token_hex(4)}.tmp")
+    try:
+        with open(temporary, "xb") as file:
+            file.write(data)
+            file.flush()
+            os.fsync(file.fileno())
+        os.replace(temporary, path)
+    finally:
+        temporary.unlink(missing_ok=True)
+    return path
+
+
+def read_safetensors(path: Path, fix: str) -> dict[str, np.ndarray]:
+    """Arrays of a safetensors file by name; errors end with `fix`."""
+    if not path.is_file():
+        raise FileNotFoundError(f"{path} does not exist; {fix}")
+    try:
+        return safetensors.numpy.load(path.read_bytes())
+    except (safetensors.SafetensorError, KeyError, ValueError) as error:
+        raise ValueError(f"{path} is cut off or no safetensors file ({error}); {fix}") from error
+
+
+def save_arrays(path: str | Path, pytree) -> Path:
+    """Write any pytree of arrays and numbers to one safetensors file, exactly.
+
+    Leaves may be NumPy or JAX arrays (float, int, uint or bool) and Python numbers; None is part
+    of the structure. New-style PRNG keys must be given as `jax.random.key_data(key)`.
+
+    Raises:
+        ValueError: for a leaf of another type.
+    """
+    return atomic_write(path, safetensors.numpy.save(dict(_leaves(pytree))))
+
+
+def load_arrays(path: str | Path, like):
+    """Read a file of `save_arrays` into the structure of `like`.
+
+    Leaves come back as what `like` holds: NumPy arrays, JAX arrays or Python numbers (NumPy arrays
+    for `jax.ShapeDtypeStruct`), with the same bits as they were saved with.
+
+    Raises:
+        FileNotFoundError: for a missing file.
+        ValueError: if the file is cut off, or its names, shapes or types differ from those of
+            `like`.
+    """
+    path = Path(path)
+    fix = "delete it to start anew, or use the configuration it was written with"
+    stored = read_safetensors(path, fix)
+    expected = dict(_leaves(like, shapes_only=True))
+    problems = [f"{name} is missing" for name in expected if name not in stored]
+    problems += [f"{name} is unknown" for name in stored if name not in expected]
+    for name, (shape, dtype) in expected.items():
+        if name in stored and (stored[name].shape, stored[name].dtype) != (shape, dtype):
+            problems.append(
+                f"{name} is {stored[name].dtype}{list(stored[name].shape)}, expected "
+                f"{dtype}{list(shape)}"
+            )
+    if problems:
+        more = f" and {len(problems) - 3} more" if len(problems) > 3 else ""
+        raise ValueError(
+            f"{path} does not fit the state to be restored: {'; '.join(problems[:3])}{more}; {fix}"
+        )
+
+    def restored(place, leaf):
+        value = stored[_leaf_name(place)]
+        if isinstance(leaf, jax.Array):
+            return jnp.array(value)
+        if isinstance(leaf, bool | int | float):
+            return value.item()
+        return value
+
+    return jax.tree_util.tree_map_with_path(restored, like)
+
+
+def _leaf_name(place) -> str:
+    return jax.tree_util.keystr(place, simple=True, separator="/") or "value"
+
+
+def _leaves(pytree, shapes_only=False):
+    """Names and arrays, or names and (shape, dtype), of the leaves of a pytree."""
+    for place, leaf in jax.tree_util.tree_leaves_with_path(pytree):
+        name = _leaf_name(place)
+        if shapes_only and hasattr(leaf, "dtype") and hasattr(leaf, "shape"):
+            yield name, (tuple(leaf.shape), np.dtype(leaf.dtype))
+            continue
+        # Copies: the leaf may be a live buffer or not contiguous.
+        array = None
+        if not (hasattr(leaf, "dtype") and jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key)):
+            array = np.array(leaf, order="C")
+        if array is None or array.dtype.kind not in "fiub":
+            raise ValueError(
+                f"leaf {name!r} is {getattr(leaf, 'dtype', type(leaf).__name__)}; expected an "
+                "array of float, int, uint or bool (for PRNG keys use jax.random.key_data)"
+            )
+        yield name, (array.shape, array.dtype) if shapes_only else array
