@@ -126,7 +126,7 @@ class TrainConfig:
                 "num_envs": 256,
                 "rollout_length": 32,
                 "minibatch_size": 2048,
-                "epochs": 4,
+                "epochs": 3,
                 "total_steps": 50_000_000,
                 "learning_rate": (1e-3, 3e-4),
                 **changes,

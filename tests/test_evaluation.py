@@ -5,7 +5,6 @@ import numpy as np
 import pytest
 from tiny import quick_compilation, tiny_agent, tiny_robot
 
-from shapebody import evaluation
 from shapebody.design import DesignSpace
 from shapebody.evaluation import (
     EvaluationConfig,
@@ -13,7 +12,8 @@ from shapebody.evaluation import (
     evaluate,
     paired_gain,
 )
-from shapebody.locomotion import TaskConfig
+from shapebody.locomotion import Locomotion, TaskConfig
+from shapebody.physics.native import NativePhysics
 
 HORIZON = 40
 TASK = TaskConfig.evaluation(horizon=HORIZON)
@@ -96,7 +96,7 @@ def test_against_a_plain_loop(agent, robot, space):
     f = 0.3 * space.start(1)
     score = native(agent, robot, f, config, seed=2)
 
-    env = evaluation._environment(robot, 8, "native", TASK)
+    env = Locomotion(robot, 8, "native", TASK, auto_reset=False)
     key = jax.random.PRNGKey(2)
     keys = np.stack([jax.random.fold_in(key, i) for i in range(8)])
     state = env.reset(key, f, coefficient=0.3, keys=keys)
@@ -119,17 +119,15 @@ def test_against_a_plain_loop(agent, robot, space):
 
 def test_broken_simulations_end_and_are_counted(agent, robot, space, monkeypatch):
     whole = native(agent, robot, space.reference, episodes=8)
-    env = evaluation._environment(robot, 8, "native", TASK)
-    physics = env.groups[0].physics
-    step, count = physics.step, iter(range(1, 100))
+    step, count = NativePhysics.step, iter(range(1, 100))
 
     def failing(*arguments, **options):
         readings = step(*arguments, **options)
-        finite = np.array(readings[3])
+        finite = np.array(readings.finite)
         finite[3] &= next(count) != 5
-        return (*readings[:3], finite)
+        return readings._replace(finite=finite)
 
-    monkeypatch.setattr(type(physics), "step", lambda self, *a, **k: failing(*a, **k))
+    monkeypatch.setattr(NativePhysics, "step", failing)
     score = native(agent, robot, space.reference, episodes=8)
     assert score.non_finite == 1 and not score.finite[3]
     assert score.lengths[3] == 5 and np.isfinite(score.returns).all()
