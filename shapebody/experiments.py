@@ -1,14 +1,10 @@
 """Scales, agents to use at each, and experiments whose results are kept with their provenance."""
 
-import importlib.metadata
 import json
 import os
-import platform
-import subprocess
 import time
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
-from pathlib import Path
 
 import numpy as np
 
@@ -69,14 +65,9 @@ def agent_name(robot: str) -> str:
 
 def provenance(agent=None, seconds: float | None = None, **config) -> dict:
     """Where a result comes from: settings, agent, versions, commit, machine, seconds."""
-    packages = ("jax", "mujoco", "flax", "optax", "numpy")
-    record = {
-        "config": config,
-        "scale": scale(),
-        "versions": {name: importlib.metadata.version(name) for name in packages},
-        "commit": _commit(),
-        "machine": f"{platform.machine()}, {os.cpu_count()} CPU cores",
-    }
+    from shapebody import checkpoints
+
+    record = {"config": config, "scale": scale(), **checkpoints.provenance()}
     if agent is not None:
         record["agent"] = {
             "name": agent.name,
@@ -86,20 +77,6 @@ def provenance(agent=None, seconds: float | None = None, **config) -> dict:
     if seconds is not None:
         record["seconds"] = round(seconds, 1)
     return record
-
-
-def _commit() -> str | None:
-    try:
-        found = subprocess.run(
-            ["git", "rev-parse", "--short", "HEAD"],
-            cwd=Path(__file__).parent,
-            capture_output=True,
-            text=True,
-            timeout=10,
-        )
-    except (OSError, subprocess.SubprocessError):
-        return None
-    return found.stdout.strip() or None
 
 
 def result(name: str, compute: Callable[[], list[dict]], agent=None, recompute=False, **config):

@@ -15,7 +15,6 @@ over the full design space.
 
 import csv
 import os
-import platform
 import sys
 import time
 from concurrent.futures import ThreadPoolExecutor
@@ -420,7 +419,10 @@ class Trainer:
         self.config = config
         self.folder = Path(folder) if folder else data_dir() / "checkpoints" / config.name
         robots = [load_robot(name) for name in config.robots]
-        self.env = Locomotion(robots, config.num_envs, engine=engine, config=config.task)
+        task = config.task
+        if not config.learn_policy:
+            task = replace(task, fixed_coefficient=True)
+        self.env = Locomotion(robots, config.num_envs, engine=engine, config=task)
         self.policy, self.critic = Policy(config.policy), Critic(config.critic)
         self.update, start = make_update(config, self.policy, self.critic)
         self.act = make_policy_function(self.policy)
@@ -494,7 +496,6 @@ class Trainer:
             "engine": self.env.engine,
             "steps": self.steps,
             "seconds": round(self.seconds, 1),
-            "machine": _machine(),
         }
         return Agent(
             name=config.name,
@@ -574,6 +575,10 @@ class Trainer:
         """
         count = self.config.state_bank
         env = self.env
+        if not env.config.fixed_coefficient:
+            # In the training environment, c would fall on bodies that the policy cannot move.
+            task = replace(env.config, fixed_coefficient=True)
+            env = Locomotion(env.robots, env.num_envs, engine=env.engine, config=task)
         state = env.reset(jax.random.fold_in(self.key, 1), coefficient=1.0, spread=True)
         length = self.config.rollout_length
         parts, robots, per = [], [], -(-count // rollouts)
@@ -818,7 +823,3 @@ def _plain(value):
     if isinstance(value, (tuple, list)):
         return [_plain(v) for v in value]
     return value
-
-
-def _machine() -> str:
-    return f"{platform.machine()}, {os.cpu_count()} CPU cores, {jax.default_backend()}"

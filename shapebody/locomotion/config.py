@@ -68,6 +68,8 @@ class TaskConfig:
     termination_height: float = 0.8
     """An episode ends below (1 - c) x this x the nominal IMU height."""
 
+    fixed_coefficient: bool = False
+    """Keep c as it was at the reset, whatever happens: for frozen policies."""
     curriculum_levels: int = 100
     """A streak of n successful episodes raises c by n over this number."""
     curriculum_error: float = 0.4

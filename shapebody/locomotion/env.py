@@ -87,7 +87,7 @@ class _Group:
         self.start = jax.vmap(
             _starter(robot, self.space, sizes, config, design_dim), in_axes=(0, 0, 0, 0)
         )
-        self.start_chunk = jax.jit(self.start)
+        self.jitted_start = jax.jit(self.start)
         self.qvel_index = np.asarray(robot.qvel_index)
 
 
@@ -253,8 +253,8 @@ class Locomotion:
                 ids = np.arange(group.count)
                 states += self._begin(group, ids, keys[s], f, coefficients[s], streaks[s])
             else:
-                start = jax.jit(group.start)
-                state, *physics = start(keys[s], jnp.asarray(f), coefficients[s], streaks[s])
+                arguments = (keys[s], jnp.asarray(f), coefficients[s], streaks[s])
+                state, *physics = group.jitted_start(*arguments)
                 states.append(state)
                 physics_states.append(group.physics.init(*physics))
         state = jax.tree.map(lambda *x: jnp.concatenate(x), *states)
@@ -278,7 +278,7 @@ class Locomotion:
             rows = np.concatenate([np.arange(at, at + m), np.full(RESET_SLOTS - m, at)])
             k, c = keys[rows], coefficients[rows]
             f = _draw_designs(k, c, group.space.dim) if designs is None else designs[rows]
-            state, embodiment, qpos, qvel = group.start_chunk(k, f, c, streaks[rows])
+            state, embodiment, qpos, qvel = group.jitted_start(k, f, c, streaks[rows])
             state, embodiment, qpos, qvel = jax.tree.map(
                 lambda x, m=m: np.asarray(x)[:m], (state, embodiment, qpos, qvel)
             )

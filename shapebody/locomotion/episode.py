@@ -202,6 +202,8 @@ def advance(config: TaskConfig, episode: Episode, readings: Readings):
 
 def next_coefficient(config: TaskConfig, episode: Episode):
     """(coefficient, streak) for the episode that follows a finished one."""
+    if config.fixed_coefficient:
+        return episode.coefficient, episode.streak
     mean_error = episode.total_error / jnp.maximum(episode.step, 1)
     limit = randomization.command_limit(config, episode.descriptions)
     success = curriculum.is_success(config, mean_error, episode.step, limit)
