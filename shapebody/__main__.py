@@ -89,7 +89,7 @@ def _design(options):
     from shapebody.checkpoints import load_agent
     from shapebody.design import DesignSpace
     from shapebody.robots import load_robot
-    from shapebody.search import search
+    from shapebody.search import Objective, search
 
     robot = load_robot(options.robot)
     agent = load_agent(options.agent or robot.name)
@@ -97,7 +97,8 @@ def _design(options):
     f = space.reference if options.start is None else space.start(options.start)
     found = search(options.method, agent, robot, f, trust_region=options.trust_region)
     print(f"{found.method}: {found.evaluations} critic evaluations, {found.seconds:.1f} s")
-    print(f"objective {found.history[0]:.2f} -> {found.history[-1]:.2f}")
+    objective = Objective.of(agent, robot, options.trust_region)
+    print(f"objective {float(objective(f[None])[0]):.2f} -> {found.objective:.2f}")
     for label, index in space.groups.items():
         change = float(np.sqrt(np.mean(found.design[index] ** 2)))
         print(f"  {label:32s} RMS change from the reference {change:.3f}")
@@ -113,7 +114,7 @@ def _evaluate(options):
     from shapebody.robots import load_robot
 
     agent = load_agent(options.agent)
-    robot = load_robot(options.robot or agent.robots[0])
+    robot = load_robot(options.robot or agent.metadata["config"]["robots"][0])
     space = DesignSpace(robot)
     f = space.reference if options.start is None else space.start(options.start)
     score = evaluate(agent, robot, f, episodes=options.episodes)

@@ -25,7 +25,7 @@ _CALLS = 50  # control steps per call of an engine that runs whole rollouts
 
 @dataclass(frozen=True)
 class EvaluationConfig:
-    """How designs are evaluated; the defaults are the paper's."""
+    """How designs are evaluated: 200 episodes as in the paper, with `TaskConfig.evaluation`."""
 
     episodes: int = 200
     """Episodes per design."""

@@ -200,6 +200,7 @@ def single_robot_design(
             "length": float(score.lengths[i].mean()),
             "predicted_value": float(predicted[i]),
             "episodes": episodes,
+            "engine": score.settings["engine"],
         }
     return records
 

@@ -14,7 +14,8 @@ over the full design space.
 """
 
 import csv
-import os
+import io
+import json
 import sys
 import time
 from concurrent.futures import ThreadPoolExecutor
@@ -27,7 +28,7 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 
-from shapebody.checkpoints import Agent, load_arrays, save_agent, save_arrays
+from shapebody.checkpoints import Agent, atomic_write, load_arrays, save_agent, save_arrays
 from shapebody.descriptions import describe
 from shapebody.design import DesignSpace
 from shapebody.locomotion import Locomotion, TaskConfig, Trajectory
@@ -86,6 +87,10 @@ class TrainConfig:
     """States kept for design search."""
 
     def __post_init__(self):
+        if not self.name or Path(self.name).name != self.name:
+            raise ValueError(
+                f"name is {self.name!r}; expected the name of a folder, without separators"
+            )
         robots = (self.robots,) if isinstance(self.robots, str) else tuple(self.robots)
         object.__setattr__(self, "robots", robots)
         batch = self.num_envs * self.rollout_length
@@ -109,14 +114,15 @@ class TrainConfig:
     @classmethod
     def full(cls, robot: str, **changes) -> "TrainConfig":
         """The paper's networks and hyperparameters, for a GPU."""
-        return cls(**{"name": f"{robot}_full", "robots": (robot,), **changes})
+        name = f"{_default_name(robot, changes)}_full"
+        return cls(**{"name": name, "robots": (robot,), **changes})
 
     @classmethod
     def reduced(cls, robot: str, **changes) -> "TrainConfig":
         """Smaller networks and budget, for two CPU cores and some hours."""
         return cls(
             **{
-                "name": robot,
+                "name": _default_name(robot, changes),
                 "robots": (robot,),
                 "scale": "reduced",
                 "policy": PolicyConfig.reduced(),
@@ -136,7 +142,7 @@ class TrainConfig:
     def smoke(cls, robot: str, **changes) -> "TrainConfig":
         """Seconds of training: proves that the code runs and claims nothing."""
         tiny = {
-            "name": f"{robot}_smoke",
+            "name": f"{_default_name(robot, changes)}_smoke",
             "scale": "smoke",
             "policy": PolicyConfig.reduced(key_widths=(8, 8), core_widths=(16, 8)),
             "critic": CriticConfig.reduced(
@@ -158,6 +164,11 @@ class TrainConfig:
         if scale not in makers:
             raise ValueError(f"scale is {scale!r}; expected one of {', '.join(makers)}")
         return makers[scale](robot, **changes)
+
+
+def _default_name(robot: str, changes: dict) -> str:
+    """Name of an agent: its robots' names, or those of their files, joined with "+"."""
+    return "+".join(Path(str(name)).stem for name in changes.get("robots", (robot,)))
 
 
 @jax.tree_util.register_dataclass
@@ -241,8 +252,9 @@ def make_update(config: TrainConfig, policy: Policy, critic: Critic):
         mask = batch["descriptions"].joint_mask[:, :1]
         logp = log_prob(mean, std, batch["action"], mask)
         weight = batch["valid"] / jnp.maximum(jnp.sum(batch["valid"]), 1.0)
-        log_ratio = logp - batch["log_prob"]
-        ratio = jnp.exp(log_ratio)
+        # Steps that do not count were computed with another body and may be anything.
+        log_ratio = jnp.where(batch["valid"] > 0, logp - batch["log_prob"], 0.0)
+        ratio = jnp.exp(jnp.clip(log_ratio, -20.0, 20.0))
         clipped = jnp.clip(ratio, 1 - config.clip_range, 1 + config.clip_range)
         advantage = batch["advantage"]
         gain = jnp.minimum(ratio * advantage, clipped * advantage) * batch["importance"]
@@ -265,8 +277,15 @@ def make_update(config: TrainConfig, policy: Policy, critic: Critic):
         return 0.5 * jnp.sum(error * weight)
 
     def step(variables, state, gradient, rate):
-        updates, state = optimizer.update(gradient, state)
+        updates, new_state = optimizer.update(gradient, state)
         params = jax.tree.map(lambda p, u: p - rate * u, variables["params"], updates)
+        # One broken minibatch must not spoil the weights and Adam's memory for good.
+        finite = jnp.isfinite(optax.tree.norm(gradient))
+        params, state = jax.tree.map(
+            lambda new, old: jnp.where(finite, new, old),
+            (params, new_state),
+            (variables["params"], state),
+        )
         return {**variables, "params": params}, state
 
     def constants(variables):
@@ -285,7 +304,8 @@ def make_update(config: TrainConfig, policy: Policy, critic: Critic):
             )
             new_policy, policy_state = step(new_policy, policy_state, gradient, rate)
             metrics |= more
-            stopped = metrics["kl"] > config.kl_threshold
+            # Not "kl > threshold", which would let a NaN pass.
+            stopped = ~(metrics["kl"] <= config.kl_threshold)
         learner = replace(
             learner,
             policy=new_policy,
@@ -434,6 +454,7 @@ class Trainer:
         self.learner = start(policy, initialize(self.critic, keys[3], constants))
         self.behaviour = self.learner.policy
         self.seconds = 0.0
+        self.phases = []
         self.state = None
         self.saved_physics = None
 
@@ -466,6 +487,10 @@ class Trainer:
 
     def save(self) -> None:
         """Write the training state."""
+        path = self.folder / "training.json"
+        text = json.dumps(self.phases, indent=1) + "\n"
+        if not path.exists() or path.read_text() != text:
+            atomic_write(path, text)
         save_arrays(self.folder / "training.safetensors", self._everything())
 
     def start(self) -> bool:
@@ -476,6 +501,12 @@ class Trainer:
         self.saved_physics = self.env.physics_arrays() if native else self.env.physics_state
         path = self.folder / "training.safetensors"
         if not path.exists():
+            if (self.folder / "agent.json").exists():
+                raise ValueError(
+                    f"{self.folder.name} has an agent but no training.safetensors to continue "
+                    "from; training anew would overwrite it: choose another name or folder"
+                )
+            self.phases = [{"from_step": 0, "config": _plain(asdict(self.config))}]
             return False
         saved = load_arrays(path, self._everything())
         self.learner, self.behaviour = saved["learner"], saved["behaviour"]
@@ -485,6 +516,7 @@ class Trainer:
             self.env.restore(self.state, self.saved_physics)
         else:
             self.env.physics_state = self.saved_physics
+        self.phases = _continued(self.folder / "training.json", self.config, self.steps)
         return True
 
     def agent(self, states=None) -> Agent:
@@ -492,6 +524,7 @@ class Trainer:
         config = self.config
         metadata = {
             "config": _plain(asdict(config)),
+            "phases": self.phases,
             "scale": config.scale,
             "engine": self.env.engine,
             "steps": self.steps,
@@ -526,7 +559,9 @@ class Trainer:
             curve_interval: iterations per row of the learning curve, CURVE_INTERVAL if not given.
         """
         config = self.config
-        last = min(config.iterations, (max_steps or config.total_steps) // config.batch)
+        last = config.iterations
+        if max_steps is not None:
+            last = min(last, max_steps // config.batch)
         number = int(self.learner.iteration)
         if number >= last:
             return
@@ -566,6 +601,8 @@ class Trainer:
                 if not overlap:
                     state, following = self._collect(self.behaviour, state, number)
                 trajectory = following
+        if curve.count:
+            curve.write(self.steps, self.seconds)
         report.end()
 
     def state_bank(self, rollouts: int = 8):
@@ -658,12 +695,13 @@ def train_critic(
         training, with those of this phase under "policy_evaluation".
     """
     folder = Path(folder) if folder else data_dir() / "checkpoints" / agent.name
-    base = TrainConfig.at_scale(agent.metadata["scale"], agent.robots[0])
+    # Robots by the names or files they were trained from.
+    robots = tuple(agent.metadata["config"]["robots"])
+    base = TrainConfig.at_scale(agent.metadata["scale"], robots[0], name=agent.name)
     config = replace(
         base,
         **{
-            "name": agent.name,
-            "robots": agent.robots,
+            "robots": robots,
             "policy": agent.policy_config,
             "critic": critic,
             "standardize": True,
@@ -693,6 +731,36 @@ def _run(trainer: Trainer, progress, max_steps, max_seconds) -> None:
             print("\ninterrupted: saved, the same call continues", flush=True)
 
 
+SCHEDULE = ("total_steps", "epochs", "minibatch_size", "learning_rate", "state_bank")
+"""Fields that may change when a run is continued; each change is recorded."""
+
+
+def _continued(path: Path, config: TrainConfig, steps: int) -> list[dict]:
+    """The phases of a run that goes on with `config`: a list of {"from_step", "config"}.
+
+    Raises:
+        ValueError: if more than the schedule differs from the run in `path`.
+    """
+    try:
+        phases = json.loads(path.read_text())
+        before = phases[-1]["config"]
+    except (OSError, ValueError, LookupError, TypeError) as error:
+        raise ValueError(
+            f"{path.name} is missing or damaged ({error}); it says how the run in "
+            f"{path.parent.name} was configured: restore it, or start anew in another folder"
+        ) from error
+    now = _plain(asdict(config))
+    different = [name for name in now if before.get(name) != now[name]]
+    other = [name for name in different if name not in SCHEDULE]
+    if other:
+        text = "; ".join(f"{name} was {before.get(name)!r}, is {now[name]!r}" for name in other)
+        raise ValueError(
+            f"the run in {path.parent.name} has another configuration ({text}); continue it with "
+            "the old one, or choose another name"
+        )
+    return phases + [{"from_step": steps, "config": now}] if different else phases
+
+
 class _Curve:
     """Averages over iterations, appended to curve.csv. Rows after the resumed step go."""
 
@@ -702,10 +770,11 @@ class _Curve:
         if path.exists():
             with path.open() as file:
                 rows = [row for row in csv.DictReader(file) if int(row["steps"]) <= steps]
-        with _replacing(path) as file:
-            writer = csv.DictWriter(file, CURVE)
-            writer.writeheader()
-            writer.writerows(rows)
+        text = io.StringIO(newline="")
+        writer = csv.DictWriter(text, CURVE)
+        writer.writeheader()
+        writer.writerows(rows)
+        atomic_write(path, text.getvalue())
         self.latest = {}
         self.episodes = (0, 0.0, 0.0, 0.0)
         self._clear()
@@ -798,22 +867,6 @@ def _duration(seconds: float) -> str:
         if minutes >= 60
         else f"{minutes}m{int(seconds) % 60:02d}"
     )
-
-
-class _replacing:
-    """Open a text file for writing that replaces `path` only when complete."""
-
-    def __init__(self, path: Path):
-        self.path, self.temporary = path, path.with_name(path.name + ".tmp")
-
-    def __enter__(self):
-        self.file = self.temporary.open("w", newline="")
-        return self.file
-
-    def __exit__(self, kind, value, traceback):
-        self.file.close()
-        if kind is None:
-            os.replace(self.temporary, self.path)
 
 
 def _plain(value):

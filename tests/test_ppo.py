@@ -96,6 +96,45 @@ def test_a_crash_while_saving_loses_nothing(config, straight, tmp_path, monkeypa
     assert again.start() and again.steps == 128
 
 
+def test_a_run_continues_only_with_its_own_configuration(config, tmp_path):
+    trainer = ppo.Trainer(config, tmp_path)
+    trainer.start()
+    trainer.run(max_steps=128, progress=False)
+    other = ppo.Trainer(replace(config, discount=0.9), tmp_path)
+    with pytest.raises(ValueError, match="discount was 0.99, is 0.9"):
+        other.start()
+    longer = ppo.Trainer(replace(config, epochs=1), tmp_path)
+    assert longer.start()
+    assert [phase["from_step"] for phase in longer.phases] == [0, 128]
+    (tmp_path / "training.json").write_text("{")
+    with pytest.raises(ValueError, match="training.json is missing or damaged"):
+        longer.start()
+    (tmp_path / "training.safetensors").rename(tmp_path / "gone")
+    (tmp_path / "agent.json").write_text("{}")
+    with pytest.raises(ValueError, match="would overwrite"):
+        longer.start()
+
+
+def test_names_of_agents():
+    assert ppo.TrainConfig.reduced("some/where/my_robot.xml").name == "my_robot"
+    several = ppo.TrainConfig.reduced("a", robots=("a", "b/c.xml"))
+    assert several.name == "a+c" and several.robots == ("a", "b/c.xml")
+    with pytest.raises(ValueError, match="without separators"):
+        ppo.TrainConfig.reduced("a", name="b/c")
+
+
+def test_a_broken_minibatch_changes_nothing(straight):
+    _, trainer = straight
+    env = trainer.env
+    state = env.reset(jax.random.PRNGKey(1), coefficient=0.0)
+    _, trajectory = env.rollout(
+        trainer.act, trainer.learner.policy, state, jax.random.PRNGKey(2), 8
+    )
+    trajectory = replace(trajectory, reward=np.full_like(trajectory.reward, np.nan))
+    after, _ = trainer.update(trainer.learner, trajectory, jax.random.PRNGKey(3))
+    assert all(np.isfinite(x).all() for x in jax.tree.leaves(after))
+
+
 def test_update_follows_the_advantage(straight):
     """Actions with positive advantage become more likely, and the critic fits its targets."""
     _, trainer = straight
@@ -114,7 +153,7 @@ def test_update_follows_the_advantage(straight):
         return float(jnp.mean(mean[:, 0]))
 
     assert mean_action(after.policy) > mean_action(learner.policy)
-    assert metrics["updates"] > 0 and 0 < metrics["kl"] < 1
+    assert metrics["updates"] > 0 and 0 < metrics["kl"] < 0.5
     later = after
     for i in range(5):
         later, more = update(later, trajectory, jax.random.PRNGKey(4 + i))
@@ -129,7 +168,7 @@ def test_curve_has_a_row_per_interval(config, tmp_path, monkeypatch):
         trainer.run(max_steps=steps, progress=False)
     rows = (tmp_path / "curve.csv").read_text().splitlines()
     assert rows[0].split(",") == ppo.CURVE
-    assert [int(row.split(",")[0]) for row in rows[1:]] == [256, 512]
+    assert [int(row.split(",")[0]) for row in rows[1:]] == [256, 512, 640]
 
 
 def test_train_and_policy_evaluation(config, tmp_path):

@@ -1,4 +1,9 @@
-"""Settings of the locomotion task: one frozen dataclass, every default from Appendix A."""
+"""Settings of the locomotion task in one frozen dataclass.
+
+Where Appendix A prints a number, it is the default. The rest (widths of noise, pushes and initial
+poses, the rules of commands, the steps of the curriculum) follows the authors' earlier public
+environment.
+"""
 
 from dataclasses import dataclass
 from math import pi
@@ -14,9 +19,9 @@ GAIT_PERIOD = 0.5
 class TaskConfig:
     """The velocity-tracking task (Appendix A).
 
-    Everything random about an episode except the design itself is scaled by the
-    curriculum coefficient c in [0, 1]: at c = 0 the robot starts in its nominal pose
-    and feels no noise, no delay and no pushes.
+    The curriculum coefficient c in [0, 1] scales designs, initial poses, noise and pushes, and
+    the delay acts only at c > 0: at c = 0 the reference robot starts in its nominal pose and
+    feels none of them. Commands do not depend on c.
     """
 
     horizon: int = 1000
@@ -87,6 +92,7 @@ class TaskConfig:
 
     @classmethod
     def evaluation(cls, **changes) -> "TaskConfig":
-        """The settings that reproduce the paper's printed returns: commands within +-1 for
-        every design and an action delay of exactly one control step."""
+        """Settings for evaluation: commands within +-1 for every design and an action delay of
+        exactly one control step. The paper does not state them all; these were chosen because
+        the authors' published policies then come close to the paper's printed returns."""
         return cls(**{"command_limit": 1.0, "action_delay": 1, **changes})

@@ -1,5 +1,7 @@
 """The performance-based curriculum coefficient c (Appendix A, "Curriculum and design sampling").
 
+The paper refers to earlier work for the rule; this is the rule of the authors' earlier environment.
+
 Each environment has its own c. A streak of successful episodes raises it faster and
 faster, a streak of failures lowers it likewise, by streak / `curriculum_levels`.
 """

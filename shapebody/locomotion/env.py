@@ -56,7 +56,8 @@ class Trajectory:
     last_observation: Observation  # [N, ...] after the last step
     episode_return: jax.Array  # [T, N] return so far, episode_length likewise
     episode_length: jax.Array
-    episode_error: jax.Array  # [T, N] mean over time and axes of |v_xy - c_xy| so far, m/s
+    episode_error: jax.Array  # [T, N] mean over time and axes of |v_xy - c_xy| so far, m/s,
+    # each term at most twice the command limit
     coefficient: jax.Array  # [T, N] curriculum coefficient
 
 

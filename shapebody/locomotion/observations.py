@@ -1,6 +1,8 @@
-"""Observations of one environment, with the paper's fixed normalization (Appendix A).
+"""Observations of one environment (Appendix A), normalized by fixed divisors.
 
-The gait clock is not mentioned in the paper; the authors' published policies read it.
+The divisors of what the policy sees are those of the authors' published policies, and so is the
+gait clock, which the paper does not mention. Those of feet and privileged observations follow
+the authors' earlier environment.
 """
 
 from dataclasses import dataclass
