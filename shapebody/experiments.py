@@ -411,7 +411,7 @@ def derived_constants(
     ]
 
 
-def before_after(agent, robot, path, start: int = 0, trust_region: float = 20.0) -> None:
+def before_after(agent, robot, path, start: int = 3, trust_region: float = 100.0) -> None:
     """Save a picture of a start design, the design VGDS finds from it, and the reference."""
     from shapebody import video
     from shapebody.design import DesignSpace
