@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 from tiny import quick_compilation, tiny_agent, tiny_robot
 
+from shapebody.checkpoints import load_agent
 from shapebody.design import DesignSpace
 from shapebody.evaluation import (
     EvaluationConfig,
@@ -14,6 +15,7 @@ from shapebody.evaluation import (
 )
 from shapebody.locomotion import Locomotion, TaskConfig
 from shapebody.physics.native import NativePhysics
+from shapebody.robots import load_robot
 
 HORIZON = 40
 TASK = TaskConfig.evaluation(horizon=HORIZON)
@@ -228,3 +230,30 @@ def test_statistics_refuse_bad_input():
         bootstrap_interval([1.0, 2.0], confidence=95)
     with pytest.raises(ValueError, match=r"\[E\] or \[S, E\]"):
         paired_gain(np.zeros((1, 2, 3)), np.zeros((1, 2, 3)))
+
+
+@pytest.mark.slow
+def test_derived_constants_change_returns_little(capsys):
+    """Reports what recomputing MuJoCo's derived constants does to returns of the shipped agent.
+
+    Full-length figures are in data/results/derived_constants_go2.json.
+    """
+    robot, agent = load_robot("unitree_go2"), load_agent("unitree_go2")
+    space = DesignSpace(robot)
+    designs = np.stack([space.reference, space.start(0), space.start(1)])
+    task = TaskConfig.evaluation(horizon=150)
+    kept, recomputed = (
+        evaluate(
+            agent,
+            robot,
+            designs,
+            engine="native",
+            config=EvaluationConfig(episodes=8, task=task, recompute_constants=switch),
+        )
+        for switch in (False, True)
+    )
+    assert not np.array_equal(kept.returns[1:], recomputed.returns[1:])
+    change = recomputed.mean - kept.mean
+    with capsys.disabled():
+        print(f"\nreturn {kept.mean.round(2)}, change with recomputed constants {change.round(3)}")
+    assert np.all(np.abs(change) < 0.5 + 0.2 * kept.mean)
