@@ -506,7 +506,7 @@ class Trainer:
                     f"{self.folder.name} has an agent but no training.safetensors to continue "
                     "from; training anew would overwrite it: choose another name or folder"
                 )
-            self.phases = [{"from_step": 0, "config": _plain(asdict(self.config))}]
+            self.phases = [{"from_step": 0, "config": _plain(self.config)}]
             return False
         saved = load_arrays(path, self._everything())
         self.learner, self.behaviour = saved["learner"], saved["behaviour"]
@@ -523,7 +523,7 @@ class Trainer:
         """The agent as trained so far."""
         config = self.config
         metadata = {
-            "config": _plain(asdict(config)),
+            "config": _plain(config),
             "phases": self.phases,
             "scale": config.scale,
             "engine": self.env.engine,
@@ -731,6 +731,11 @@ def _run(trainer: Trainer, progress, max_steps, max_seconds) -> None:
             print("\ninterrupted: saved, the same call continues", flush=True)
 
 
+def _plain(config: TrainConfig) -> dict:
+    """A configuration as it reads back from JSON: tuples are lists."""
+    return json.loads(json.dumps(asdict(config)))
+
+
 SCHEDULE = ("total_steps", "epochs", "minibatch_size", "learning_rate", "state_bank")
 """Fields that may change when a run is continued; each change is recorded."""
 
@@ -749,7 +754,7 @@ def _continued(path: Path, config: TrainConfig, steps: int) -> list[dict]:
             f"{path.name} is missing or damaged ({error}); it says how the run in "
             f"{path.parent.name} was configured: restore it, or start anew in another folder"
         ) from error
-    now = _plain(asdict(config))
+    now = _plain(config)
     different = [name for name in now if before.get(name) != now[name]]
     other = [name for name in different if name not in SCHEDULE]
     if other:
@@ -867,12 +872,3 @@ def _duration(seconds: float) -> str:
         if minutes >= 60
         else f"{minutes}m{int(seconds) % 60:02d}"
     )
-
-
-def _plain(value):
-    """Dataclass dictionaries as JSON: tuples become lists."""
-    if isinstance(value, dict):
-        return {k: _plain(v) for k, v in value.items()}
-    if isinstance(value, (tuple, list)):
-        return [_plain(v) for v in value]
-    return value

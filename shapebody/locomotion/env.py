@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from shapebody.descriptions import Descriptions, Sizes, describe, kinematics
-from shapebody.design import DesignSpace
+from shapebody.design import DesignSpace, quaternion_product
 from shapebody.locomotion import episode as episodes
 from shapebody.locomotion import randomization
 from shapebody.locomotion.config import TaskConfig
@@ -124,7 +124,7 @@ def _starter(robot: Robot, space: DesignSpace, sizes: Sizes, config: TaskConfig,
             angular_velocity=jnp.zeros(3),
             linear_velocity=jnp.zeros(3),
             imu_height=frames.site_pos[robot.imu_site, 2] + lift,
-            imu_quat=_quat_product(quat, site_quat),
+            imu_quat=quaternion_product(quat, site_quat),
             foot_position=padded(frames.geom_pos[feet] + rise, sizes.feet),
             foot_down=padded(frames.geom_rot[feet, 2], sizes.feet),
             foot_velocity=jnp.zeros((sizes.feet, 3)),
@@ -497,16 +497,3 @@ def _draw_designs(keys, coefficients, dim: int):
         return jax.random.uniform(jax.random.fold_in(key, 7), (dim,), minval=-1.0, maxval=1.0) * c
 
     return jax.vmap(draw)(keys, coefficients)
-
-
-def _quat_product(a, b):
-    aw, ax, ay, az = a
-    bw, bx, by, bz = b
-    return jnp.stack(
-        [
-            aw * bw - ax * bx - ay * by - az * bz,
-            aw * bx + ax * bw + ay * bz - az * by,
-            aw * by - ax * bz + ay * bw + az * bx,
-            aw * bz + ax * by - ay * bx + az * bw,
-        ]
-    )
