@@ -395,7 +395,7 @@ def describe(robot: Robot, sizes: Sizes | None = None) -> Callable[[Embodiment],
         imu_height = home_height + jnp.sum(up * e.site_pos[robot.imu_site])
         radius = size[0, : robot.num_spheres]
         distance2 = sum((row[:, None] - row[None]) ** 2 for row in spheres)
-        touching = distance2 < (radius[:, None] + radius[None]) ** 2
+        touching = distance2 <= (radius[:, None] + radius[None]) ** 2
         collisions = jnp.sum(jnp.where(above_diagonal, touching, False).astype(jnp.float32))
 
         return Descriptions(
