@@ -412,7 +412,7 @@ CURVE = (
     "steps seconds return length tracking_error coefficient reward non_finite kl clipped std "
     "value_loss explained_variance learning_rate steps_per_second"
 ).split()
-"""Columns of curve.csv. return, length, tracking_error (m/s): means over the episodes that
+"""Columns of the learning curve. return, length, tracking_error (m/s): means over the episodes that
 ended since the last row; coefficient and reward: means over steps; non_finite: episodes that
 were ended because the simulation became invalid."""
 
@@ -425,7 +425,8 @@ class Trainer:
 
     Everything that determines its future is in `training.safetensors` in the agent's folder,
     written after every iteration: a killed run continues as if nothing had happened and
-    repeats at most one rollout.
+    repeats at most one rollout. Beside it, `training.csv` is the learning curve so far; the
+    agent itself and its `curve.csv` change only in `save_agent`.
 
     Args:
         config: the run.
@@ -543,6 +544,15 @@ class Trainer:
             metadata=metadata,
         )
 
+    def save_agent(self) -> Agent:
+        """Write the agent as trained so far, with a fresh state bank and its learning curve."""
+        agent = self.agent(self.state_bank())
+        save_agent(agent, self.folder)
+        curve = self.folder / "training.csv"
+        if curve.exists():
+            atomic_write(self.folder / "curve.csv", curve.read_text())
+        return agent
+
     # -------------------------------------------------------------- the loop
 
     def _collect(self, behaviour, state, number):
@@ -566,7 +576,7 @@ class Trainer:
         if number >= last:
             return
         self.folder.mkdir(parents=True, exist_ok=True)
-        curve = _Curve(self.folder / "curve.csv", self.steps)
+        curve = _Curve(self.folder / "training.csv", self.steps)
         report = _Report(config, progress)
         # On an accelerator there is nothing to overlap: the device does one thing at a time.
         overlap = self.env.engine == "native"
@@ -661,9 +671,7 @@ def train(
     trainer = Trainer(config, folder, engine)
     trainer.start()
     _run(trainer, progress, max_steps, max_seconds)
-    agent = trainer.agent(trainer.state_bank())
-    save_agent(agent, trainer.folder)
-    return agent
+    return trainer.save_agent()
 
 
 def train_critic(
@@ -767,7 +775,7 @@ def _continued(path: Path, config: TrainConfig, steps: int) -> list[dict]:
 
 
 class _Curve:
-    """Averages over iterations, appended to curve.csv. Rows after the resumed step go."""
+    """Averages over iterations, appended to a CSV file. Rows after the resumed step go."""
 
     def __init__(self, path: Path, steps: int):
         self.path = path

@@ -166,7 +166,7 @@ def test_curve_has_a_row_per_interval(config, tmp_path, monkeypatch):
         trainer = ppo.Trainer(config, tmp_path)
         trainer.start()
         trainer.run(max_steps=steps, progress=False)
-    rows = (tmp_path / "curve.csv").read_text().splitlines()
+    rows = (tmp_path / "training.csv").read_text().splitlines()
     assert rows[0].split(",") == ppo.CURVE
     assert [int(row.split(",")[0]) for row in rows[1:]] == [256, 512, 640]
 
@@ -174,6 +174,15 @@ def test_curve_has_a_row_per_interval(config, tmp_path, monkeypatch):
 def test_train_and_policy_evaluation(config, tmp_path):
     agent = ppo.train(config, tmp_path / "a", progress=False, max_steps=128)
     loaded = load_agent(tmp_path / "a")
+    curve = (tmp_path / "a" / "curve.csv").read_text()
+    assert curve.splitlines()[-1].startswith("128,")
+    # Training on does not touch the agent or its curve until the agent is saved.
+    trainer = ppo.Trainer(config, tmp_path / "a")
+    trainer.start()
+    trainer.run(max_steps=256, progress=False)
+    assert (tmp_path / "a" / "training.csv").read_text().splitlines()[-1].startswith("256,")
+    assert (tmp_path / "a" / "curve.csv").read_text() == curve
+    assert load_agent(tmp_path / "a").hash == loaded.hash
     assert loaded.metadata["steps"] == 128 and loaded.robots == ("unitree_go2",)
     assert agent.states.joints.shape == (64, 12, 4)
     small = CriticConfig.reduced(
