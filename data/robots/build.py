@@ -17,6 +17,7 @@ import mujoco
 import numpy as np
 
 FRICTION = "1 1 0.005 0.0001 0.0001"
+LICENCES = Path(__file__).resolve().parent / "licences.json"
 MATERIALS = {  # red, green, blue, alpha, specular
     "trunk": ("0.17 0.19 0.23 1", "0.35"),
     "motor": ("0.30 0.33 0.38 1", "0.4"),
@@ -281,7 +282,16 @@ def home(model: mujoco.MjModel, sheet: dict, feet: list[str]):
     return qpos, data.geom_xpos[moving].min(axis=0), data.geom_xpos[moving].max(axis=0)
 
 
-def sources(sheets: list[dict]) -> str:
+def licence(source: dict, licences: dict) -> str:
+    """Licence of a source in words; a repository of many robots may have one per folder."""
+    folder = f"{source['repo']}/{source['path'].split('/')[0]}"
+    found = licences.get(folder) or licences.get(source["repo"])
+    return (
+        f"licence: {found['licence']}, read in {found['read_in']}" if found else "licence not found"
+    )
+
+
+def sources(sheets: list[dict], licences: dict) -> str:
     """Markdown page with the sources and estimates of the given robots."""
     lines = [
         "# Robots and their sources",
@@ -291,7 +301,8 @@ def sources(sheets: list[dict]) -> str:
         "textures. `d` is the dimension of the design vector.",
         "",
         "Gains, action scale, number of actuators and `d` are those of the paper. What the sources",
-        "do not give, or what was chosen, is listed as estimated.",
+        "do not give, or what was chosen, is listed as estimated. No file was copied. Licences are",
+        "those of the sources, where one was found in them, for those who go back to the originals.",
         "",
     ]
     for sheet in sheets:
@@ -304,7 +315,8 @@ def sources(sheets: list[dict]) -> str:
             "",
         ]
         lines += [
-            f"- Source: {source['repo']}, `{source['path']}` ({source['use']})"
+            f"- Source: {source['repo']}, `{source['path']}` ({source['use']}; "
+            f"{licence(source, licences)})"
             for source in sheet["sources"]
         ]
         estimated = "; ".join(sheet["estimated"]) or "nothing besides the shapes drawn for looks"
@@ -337,7 +349,8 @@ def main() -> None:
         print(f"{name}.xml")
     built = [path for name, path in sheets.items() if (arguments.out / f"{name}.xml").exists()]
     pages = [json.loads(path.read_text(encoding="utf-8")) for path in built]
-    write(arguments.out / "SOURCES.md", sources(pages))
+    licences = json.loads(LICENCES.read_text(encoding="utf-8"))
+    write(arguments.out / "SOURCES.md", sources(pages, licences))
 
 
 if __name__ == "__main__":
