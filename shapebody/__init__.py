@@ -17,6 +17,7 @@ _MODULE_OF = {
     "Robot": "robots",
     "load_robot": "robots",
     "robots": "robots",
+    "validate_robot": "validation",
     "DesignSpace": "design",
     "Embodiment": "design",
     "describe": "descriptions",

@@ -1,4 +1,4 @@
-"""Command line for long runs: python -m shapebody train | sharpen | design | evaluate."""
+"""Command line: python -m shapebody train | sharpen | design | evaluate | validate."""
 
 import argparse
 import os
@@ -42,7 +42,13 @@ def main(arguments=None) -> int:
     evaluate.add_argument("--start", type=int, help="start design number (default: the reference)")
     evaluate.add_argument("--episodes", type=int, default=200)
 
+    validate = commands.add_parser("validate", help="what the method sees in a robot file")
+    validate.add_argument("robot", help="an MJCF or URDF file, or a name in data/robots")
+    validate.add_argument("--out", help="write the completed file to this MJCF file")
+
     options = parser.parse_args(arguments)
+    if options.command == "validate":
+        return _validate(options)
     if options.command in ("train", "sharpen"):
         os.environ["XLA_FLAGS"] = f"{os.environ.get('XLA_FLAGS', '')} {_FLAG}".strip()
     from shapebody.runtime import enable_compilation_cache
@@ -105,6 +111,20 @@ def _design(options):
     if options.out:
         Path(options.out).write_text(space.to_mjcf(found.design))
         print(f"wrote {options.out}")
+
+
+def _validate(options) -> int:
+    from shapebody.validation import validate_robot
+
+    report = validate_robot(options.robot)
+    print(report)
+    if options.out:
+        try:
+            print(f"\nwrote {report.write(options.out)}")
+        except (ValueError, OSError) as error:
+            print(f"shapebody: {error}", file=sys.stderr)
+            return 1
+    return 0 if report.ok else 1
 
 
 def _evaluate(options):

@@ -162,11 +162,7 @@ def write_mjcf(robot: Robot, embodiment, scale) -> str:
 
 def _reference_text(robot: Robot) -> str:
     """The robot's MJCF as MuJoCo writes it: one file, radians, resolved defaults and order."""
-    spec = (
-        mujoco.MjSpec.from_file(str(robot.path))
-        if robot.path is not None
-        else mujoco.MjSpec.from_string(robot.xml)
-    )
+    spec = mujoco.MjSpec.from_string(robot.xml)
     # Settings with which a compiler would change the inertials that are written below.
     spec.compiler.inertiafromgeom = mujoco.mjtInertiaFromGeom.mjINERTIAFROMGEOM_AUTO
     spec.compiler.boundmass = spec.compiler.boundinertia = 0

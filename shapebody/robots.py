@@ -1,7 +1,8 @@
 """Robots: a compiled MJCF file plus what the method reads from it.
 
 A robot file is plain MJCF: one floating body, hinge joints with limits, position actuators, feet
-that touch the floor, an IMU site and a "home" keyframe. All arrays of `Robot` are in MuJoCo order.
+that touch the floor, an IMU site and a "home" keyframe. What else an MJCF or URDF file lacks is
+inferred from the rest of it (`shapebody.inference`). All arrays of `Robot` are in MuJoCo order.
 """
 
 import difflib
@@ -12,11 +13,13 @@ from pathlib import Path
 import mujoco
 import numpy as np
 
+from shapebody.inference import COLLISION_GROUP, complete, read
 from shapebody.paths import data_dir
 
-COLLISION_GROUP = 5
 FOOT_SPHERE, FOOT_BOX = 0, 1
 PAIR_FRICTION = (1.0, 1.0, 0.005, 0.0001, 0.0001)
+SUFFIXES = (".xml", ".urdf", ".mjcf")
+MIN_MASS, MIN_INERTIA = 1e-7, 1e-11  # kg, kg m²; those of real robots are above 1e-6 and 1e-10
 
 _OBJ, _JOINT, _SENSOR = mujoco.mjtObj, mujoco.mjtJoint, mujoco.mjtSensor
 
@@ -30,7 +33,8 @@ class Robot:
     morphology: str
     path: Path | None
     xml: str
-    """Text of the file."""
+    """MJCF text that stands by itself: that of the file, or the completed one if anything was
+    inferred. Loaded again, it gives the same robot with nothing inferred."""
     model: mujoco.MjModel
     joints: np.ndarray
     """int[nj], MuJoCo ids of the hinge joints (all but the free joint)."""
@@ -62,6 +66,8 @@ class Robot:
     """Slices of `sensordata`: imu_angular_velocity, imu_linear_velocity, imu_position,
     imu_orientation, foot_positions, foot_orientations, foot_velocities, sphere_positions,
     actuator_forces."""
+    inferred: tuple[str, ...] = ()
+    """What the file lacked and what is assumed instead, one sentence each."""
 
     @property
     def num_bodies(self) -> int:
@@ -118,36 +124,38 @@ def robots() -> list[str]:
 
 
 def load_robot(name_or_path: str | Path) -> Robot:
-    """Load a robot by name (see `robots()`) or from an MJCF file.
+    """Load a robot by name (see `robots()`) or from an MJCF or URDF file.
 
-    A string that ends in ".xml" and any Path is a file. Missing sensors and foot–floor contact
-    pairs are added to the model; everything else must be in the file.
+    A string that ends in ".xml" or ".urdf" and any Path is a file. What the file lacks is inferred
+    where that is possible; `Robot.inferred` says what, and `shapebody.validate_robot` shows it.
 
     Raises ValueError for an unknown name, for text that MuJoCo cannot compile and for a model that
     does not fit (every problem is listed); FileNotFoundError for a missing file.
     """
-    path = _find(name_or_path)
-    spec, model = _compile(path)
-    problems = [message for check in CHECKS for message in check(model)]
+    path = find(name_or_path)
+    robot, problems, _ = examine(path)
     if problems:
         listing = "\n".join(f"  - {message}" for message in problems)
         raise ValueError(f"{path} cannot be used as a robot:\n{listing}")
-    if _complete(spec, model):
-        model = spec.compile()
-    return _read(path.stem, path, path.read_text(encoding="utf-8"), model)
+    return robot
 
 
-def _find(name_or_path: str | Path) -> Path:
+def find(name_or_path: str | Path) -> Path:
+    """The file of a robot given by name or path. Raises as `load_robot`."""
     if not isinstance(name_or_path, str | Path):
         raise TypeError(
             f"load_robot expects a robot name or a path, got {type(name_or_path).__name__}"
         )
-    if isinstance(name_or_path, Path) or name_or_path.endswith(".xml"):
+    if isinstance(name_or_path, Path) or name_or_path.endswith((*SUFFIXES, "/")):
         path = Path(name_or_path).expanduser()
+        if path.is_dir():
+            files = sorted(file.name for file in path.iterdir() if file.suffix in SUFFIXES)
+            inside = f"one of its files: {', '.join(files[:8])}" if files else "an MJCF file"
+            raise ValueError(f"{path} is a folder: expected a file; give the path of {inside}")
         if not path.is_file():
             raise FileNotFoundError(
                 f"robot file {str(name_or_path)!r} does not exist (looked at {path.absolute()}): "
-                "give the path of an MJCF file, or one of the names of shapebody.robots()"
+                "give the path of an MJCF or URDF file, or one of the names of shapebody.robots()"
             )
         return path
     names = robots()
@@ -156,33 +164,35 @@ def _find(name_or_path: str | Path) -> Path:
         hint = f" Did you mean {' or '.join(map(repr, close))}?" if close else ""
         raise ValueError(
             f"unknown robot {name_or_path!r}.{hint} Available robots: {', '.join(names) or 'none'}."
-            " For a file of your own give its path, ending in '.xml'"
+            " For a file of your own give its path, ending in '.xml' or '.urdf'"
         )
     return data_dir() / "robots" / f"{name_or_path}.xml"
 
 
-def _compile(path: Path) -> tuple[mujoco.MjSpec, mujoco.MjModel]:
-    try:
-        spec = mujoco.MjSpec.from_file(str(path))
-        _name_parts(spec)
-        return spec, spec.compile()
-    except ValueError as error:
-        raise ValueError(
-            f"{path} is not a valid MJCF file: MuJoCo reports {str(error).strip()!r}. "
-            "Expected a complete XML file with a <mujoco> root; correct the reported element"
-        ) from error
+def examine(path: Path) -> tuple[Robot | None, list[str], tuple[str, ...]]:
+    """Robot of a file (None if there are problems), problems, and what was inferred.
 
-
-def _name_parts(spec: mujoco.MjSpec) -> None:
-    """Name what sensors refer to and MJCF leaves optional."""
-    spheres = [geom for geom in spec.geoms if geom.group == COLLISION_GROUP]
-    for index, geom in enumerate(spheres):
-        geom.name = geom.name or f"sphere_{index}"
-    for actuator in spec.actuators:
-        actuator.name = actuator.name or actuator.target
+    Raises ValueError for a file that MuJoCo cannot compile.
+    """
+    text, spec, model, notes = read(path)
+    problems = [message for check in CHECKS for message in check(model)]
+    if problems:
+        return None, problems, tuple(notes)
+    notes += complete(spec, model)
+    if notes:
+        text = spec.to_xml()
+        spec = mujoco.MjSpec.from_string(text)
+        model = spec.compile()
+    problems = [message for check in (*CHECKS, check_feet) for message in check(model)]
+    if problems:
+        return None, problems, tuple(notes)
+    if _add_sensors(spec, model):
+        model = spec.compile()
+    return _read(path.stem, path, text, model, tuple(notes)), [], tuple(notes)
 
 
 # Checks. Each takes a compiled model and yields one message per problem: what, expected, fix.
+# They judge what cannot be inferred; what is merely missing is no problem.
 
 
 def check_tree(model: mujoco.MjModel) -> Iterator[str]:
@@ -230,19 +240,72 @@ def check_joints(model: mujoco.MjModel) -> Iterator[str]:
             )
 
 
-def check_actuators(model: mujoco.MjModel) -> Iterator[str]:
-    """One position actuator with a torque limit per driven hinge joint."""
-    if model.nu == 0:
+def check_numbers(model: mujoco.MjModel) -> Iterator[str]:
+    """Finite numbers."""
+    for fields, kind in (
+        (("body_pos", "body_quat", "body_ipos", "body_mass", "body_inertia"), _OBJ.mjOBJ_BODY),
+        (("jnt_pos", "jnt_axis", "jnt_range", "jnt_stiffness"), _OBJ.mjOBJ_JOINT),
+        (("geom_pos", "geom_quat", "geom_size"), _OBJ.mjOBJ_GEOM),
+        (("actuator_gainprm", "actuator_biasprm", "actuator_forcerange"), _OBJ.mjOBJ_ACTUATOR),
+        (("key_qpos",), _OBJ.mjOBJ_KEY),
+    ):
+        for field in fields:
+            values = getattr(model, field)
+            for index in (i for i, value in enumerate(values) if not np.isfinite(value).all()):
+                yield (
+                    f"{field} of {_name(model, kind, index)} is {_shown(values[index])}: expected "
+                    "finite numbers; correct the element"
+                )
+
+
+def check_masses(model: mujoco.MjModel) -> Iterator[str]:
+    """Bodies that move have mass and inertia."""
+    moving = model.body_weldid
+    for body in range(1, model.nbody):
+        if model.body_dofnum[body] == 0:
+            continue
+        mass = model.body_mass[moving == body].sum()
+        inertia = model.body_inertia[moving == body].max(axis=0).min()
+        if not (mass >= MIN_MASS and inertia >= MIN_INERTIA):
+            # What is below 1e-9 is what `read` put in place of nothing.
+            shown = f"{mass if mass > 1e-9 else 0:g} kg and {inertia if inertia > 1e-13 else 0:g}"
+            yield (
+                f"body {_name(model, _OBJ.mjOBJ_BODY, body)} has mass and inertia {shown} kg m²: "
+                f"expected at least {MIN_MASS:g} and {MIN_INERTIA:g} for a body that moves; add "
+                '<inertial pos="..." mass="..." diaginertia="..."/> (in a URDF, <inertial> with '
+                "<mass> and <inertia>)"
+            )
+
+
+def check_loops(model: mujoco.MjModel) -> Iterator[str]:
+    """A tree of rigid bodies: no equality constraints, nothing soft."""
+    for kind in np.unique(model.eq_type):
+        label = mujoco.mjtEq(kind).name.removeprefix("mjEQ_").lower()
+        ids = np.flatnonzero(model.eq_type == kind)
+        names = ", ".join(_name(model, _OBJ.mjOBJ_EQUALITY, index) for index in ids[:6])
         yield (
-            "no actuators: expected one <position> actuator per driven joint; add an "
-            "<actuator> section with joint, kp, kv and forcerange"
+            f"{len(ids)} equality constraints of type {label} ({names}): expected none, since a "
+            "design would pull the constrained parts apart; drive the joints directly (a mimic "
+            "joint: by an actuator of its own, or make it fixed)"
+        )
+    if model.nflex:
+        yield f"{model.nflex} flexible bodies: expected rigid bodies only; remove <flexcomp>"
+
+
+def check_actuators(model: mujoco.MjModel) -> Iterator[str]:
+    """At most one actuator per hinge joint, and something to drive."""
+    if not np.any(model.jnt_type == _JOINT.mjJNT_HINGE):
+        yield (
+            "no hinge joints: expected at least one to drive; add "
+            '<joint axis="..." range="..."/> to the bodies that move, and an <actuator> section'
         )
     driven: dict[int, str] = {}
     for actuator in range(model.nu):
         name = _name(model, _OBJ.mjOBJ_ACTUATOR, actuator)
         joint = int(model.actuator_trnid[actuator, 0])
         if (
-            model.actuator_trntype[actuator] != mujoco.mjtTrn.mjTRN_JOINT
+            mujoco.mjtTrn(model.actuator_trntype[actuator])
+            not in (mujoco.mjtTrn.mjTRN_JOINT, mujoco.mjtTrn.mjTRN_JOINTINPARENT)
             or model.jnt_type[joint] != _JOINT.mjJNT_HINGE
         ):
             yield (
@@ -256,55 +319,15 @@ def check_actuators(model: mujoco.MjModel) -> Iterator[str]:
                 f"{_name(model, _OBJ.mjOBJ_JOINT, joint)}: expected one per joint; remove one"
             )
         driven.setdefault(joint, name)
-        p_gain = model.actuator_gainprm[actuator, 0]
-        if (
-            model.actuator_gaintype[actuator] != mujoco.mjtGain.mjGAIN_FIXED
-            or model.actuator_biastype[actuator] != mujoco.mjtBias.mjBIAS_AFFINE
-            or model.actuator_dyntype[actuator] != mujoco.mjtDyn.mjDYN_NONE
-            or p_gain <= 0
-            or model.actuator_biasprm[actuator, 1] != -p_gain
-        ):
-            yield (
-                f"actuator {name} is not a position servo: expected "
-                '<position kp="..." kv="..."/> with kp > 0; replace it'
-            )
-        low, high = model.actuator_forcerange[actuator]
-        if not model.actuator_forcelimited[actuator] or not low == -high < 0:
-            yield (
-                f"actuator {name} has no symmetric torque limit: expected "
-                'forcerange="-limit limit" in N m; add it'
-            )
-    gains = {(model.actuator_gainprm[i, 0], model.actuator_biasprm[i, 2]) for i in range(model.nu)}
-    if len(gains) > 1:
-        listing = ", ".join(f"{p:g}/{-d:g}" for p, d in sorted(gains))
-        yield (
-            f"actuators have {len(gains)} different kp/kv ({listing}): expected one P and one D "
-            "gain for the whole robot; use the same kp and kv everywhere"
-        )
 
 
 def check_feet(model: mujoco.MjModel) -> Iterator[str]:
-    """Sphere or box feet, and a floor below them."""
-    feet = _foot_ids(model)
-    if len(feet) == 0:
+    """Feet. Asked of the completed model."""
+    if len(_foot_ids(model)) == 0:
         yield (
-            'no geom has "foot" in its name: expected one sphere or box per foot; '
-            'name the geoms that touch the floor, e.g. name="left_foot"'
-        )
-    for geom in feet:
-        kind = mujoco.mjtGeom(model.geom_type[geom])
-        if kind not in (mujoco.mjtGeom.mjGEOM_SPHERE, mujoco.mjtGeom.mjGEOM_BOX):
-            yield (
-                f"foot geom {_name(model, _OBJ.mjOBJ_GEOM, geom)} is a "
-                f"{kind.name.removeprefix('mjGEOM_').lower()}: expected a sphere or a box; "
-                'replace it by one of these (or take "foot" out of the name of a geom '
-                "that is only for looks)"
-            )
-    floor = mujoco.mj_name2id(model, _OBJ.mjOBJ_GEOM, "floor")
-    if floor < 0 or model.geom_type[floor] != mujoco.mjtGeom.mjGEOM_PLANE:
-        yield (
-            'no floor: expected a plane geom named "floor" in the worldbody; add '
-            '<geom name="floor" type="plane" size="0 0 0.05" contype="0" conaffinity="0"/>'
+            'no geom has "foot" in its name, and no leg ends in a geom that could be a foot: '
+            "expected one sphere or box per foot; add them where the robot touches the floor, e.g. "
+            '<geom name="left_foot" type="sphere" size="0.02" pos="0 0 -0.2"/>'
         )
 
 
@@ -318,45 +341,26 @@ def check_spheres(model: mujoco.MjModel) -> Iterator[str]:
             )
 
 
-def check_imu(model: mujoco.MjModel) -> Iterator[str]:
-    """A site "imu" in the trunk."""
-    site = mujoco.mj_name2id(model, _OBJ.mjOBJ_SITE, "imu")
-    if site < 0:
-        yield 'no site "imu": expected one in the trunk; add <site name="imu" pos="0 0 0"/>'
-    elif model.site_bodyid[site] != 1:
-        body = _name(model, _OBJ.mjOBJ_BODY, model.site_bodyid[site])
-        yield f'site "imu" is in body {body}: expected it in the trunk (the first body); move it'
-
-
-def check_home(model: mujoco.MjModel) -> Iterator[str]:
-    """A keyframe "home", the nominal standing pose."""
-    key = mujoco.mj_name2id(model, _OBJ.mjOBJ_KEY, "home")
-    if key < 0:
-        yield (
-            'no keyframe "home": expected the nominal standing pose; add <keyframe><key '
-            f'name="home" qpos="..."/></keyframe> with {model.nq} numbers'
-        )
-
-
 def check_custom(model: mujoco.MjModel) -> Iterator[str]:
-    """Custom numbers: action scale, velocity limits and, optional, keep-nominal flags."""
+    """Custom numbers: action scale, velocity limits and keep-nominal flags."""
     scale, speeds, keep = (
         _numeric(model, name) for name in ("action_scale", "velocity_limits", "keep_nominal")
     )
-    if scale is None or scale.shape != (1,) or not scale[0] > 0:
+    if scale is not None and not (scale.shape == (1,) and scale[0] > 0):
         yield (
             f'custom numeric "action_scale" is {_shown(scale)}: expected one number > 0 (rad); '
-            'add <custom><numeric name="action_scale" data="0.3"/></custom>'
+            'write <custom><numeric name="action_scale" data="0.3"/></custom>'
         )
-    if model.nu and (speeds is None or speeds.shape != (model.nu,) or not np.all(speeds > 0)):
+    count = model.nu or int(np.sum(model.jnt_type == _JOINT.mjJNT_HINGE))
+    if speeds is not None and not (speeds.shape == (count,) and np.all(speeds > 0)):
         yield (
-            f'custom numeric "velocity_limits" is {_shown(speeds)}: expected {model.nu} numbers '
-            "> 0 (rad/s, one per actuator, in actuator order); add "
+            f'custom numeric "velocity_limits" is {_shown(speeds)}: expected {count} numbers '
+            "> 0 (rad/s, one per actuator, in actuator order); write "
             '<custom><numeric name="velocity_limits" data="..."/></custom>'
         )
-    if keep is not None and (keep.shape != (model.nu,) or not np.all((keep == 0) | (keep == 1))):
+    if keep is not None and (keep.shape != (count,) or not np.all((keep == 0) | (keep == 1))):
         yield (
-            f'custom numeric "keep_nominal" is {_shown(keep)}: expected {model.nu} flags 0 or 1 '
+            f'custom numeric "keep_nominal" is {_shown(keep)}: expected {count} flags 0 or 1 '
             "(one per actuator); correct or remove it"
         )
 
@@ -364,11 +368,11 @@ def check_custom(model: mujoco.MjModel) -> Iterator[str]:
 CHECKS: tuple[Callable[[mujoco.MjModel], Iterator[str]], ...] = (
     check_tree,
     check_joints,
+    check_numbers,
+    check_masses,
+    check_loops,
     check_actuators,
-    check_feet,
     check_spheres,
-    check_imu,
-    check_home,
     check_custom,
 )
 
@@ -377,8 +381,8 @@ def _name(model: mujoco.MjModel, kind: mujoco.mjtObj, index: int) -> str:
     return repr(mujoco.mj_id2name(model, kind, int(index)) or f"number {index}")
 
 
-def _shown(values: np.ndarray | None) -> str:
-    return "missing" if values is None else np.array2string(values, threshold=6)
+def _shown(values: np.ndarray) -> str:
+    return np.array2string(values, threshold=6)
 
 
 def _foot_ids(model: mujoco.MjModel) -> np.ndarray:
@@ -449,7 +453,7 @@ def _slices(model: mujoco.MjModel) -> dict[str, slice] | None:
     return slices
 
 
-def _complete(spec: mujoco.MjSpec, model: mujoco.MjModel) -> bool:
+def _add_sensors(spec: mujoco.MjSpec, model: mujoco.MjModel) -> bool:
     """Add missing sensors and foot–floor pairs to `spec`; says whether anything was added."""
     changed = False
     if _slices(model) is None:
@@ -474,7 +478,7 @@ def _complete(spec: mujoco.MjSpec, model: mujoco.MjModel) -> bool:
     return changed
 
 
-def _read(name: str, path: Path | None, xml: str, model: mujoco.MjModel) -> Robot:
+def _read(name: str, path: Path | None, xml: str, model: mujoco.MjModel, inferred) -> Robot:
     joints = np.flatnonzero(model.jnt_type == _JOINT.mjJNT_HINGE)
     actuated = np.searchsorted(joints, model.actuator_trnid[:, 0])
     feet = _foot_ids(model)
@@ -504,7 +508,8 @@ def _read(name: str, path: Path | None, xml: str, model: mujoco.MjModel) -> Robo
         velocity_limits=_numeric(model, "velocity_limits"),
         keep_nominal=np.zeros(model.nu, dtype=bool) if keep is None else keep == 1,
         p_gain=float(model.actuator_gainprm[0, 0]),
-        d_gain=float(-model.actuator_biasprm[0, 2]),
+        d_gain=0.0 - float(model.actuator_biasprm[0, 2]),
         action_scale=float(_numeric(model, "action_scale")[0]),
         sensors=_slices(model),
+        inferred=inferred,
     )

@@ -1,0 +1,298 @@
+"""What the method sees in a robot file: problems, what was inferred, warnings of plain physics."""
+
+from __future__ import annotations
+
+import textwrap
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import mujoco
+import numpy as np
+
+from shapebody.inference import FLOOR_TOLERANCE, leg_torque
+from shapebody.robots import Robot, examine, find
+
+RANGE_CHANGE = 0.8  # rad: in a design both limits of a joint can move towards each other by half
+
+
+@dataclass(frozen=True, eq=False)
+class Report:
+    """Result of `validate_robot`; prints as text."""
+
+    path: Path
+    robot: Robot | None
+    """The robot, or None if there are problems."""
+    problems: tuple[str, ...]
+    """Why the file cannot be used: value, what was expected, fix. As in errors of `load_robot`."""
+    inferred: tuple[str, ...]
+    """What the file lacks and what is assumed instead, with the way to say it in the file."""
+    warnings: tuple[str, ...]
+    """What can be used but looks wrong or will hurt."""
+    summary: dict[str, str] = field(default_factory=dict)
+    """What the method sees, label -> value."""
+
+    @property
+    def ok(self) -> bool:
+        """Whether the robot can be used."""
+        return not self.problems
+
+    def write(self, path: str | Path) -> Path:
+        """Write the completed MJCF file, which needs nothing inferred.
+
+        Raises ValueError if there are problems, and for the path of the file itself.
+        """
+        if not self.ok:
+            raise ValueError(
+                f"{self.path} has {len(self.problems)} problems, so there is no completed file to "
+                "write; correct them first"
+            )
+        path = Path(path)
+        if self.inferred and path.exists() and path.samefile(self.path):
+            raise ValueError(
+                f"{path} is the file itself, and the completed one has no meshes and other text: "
+                "give another name"
+            )
+        from shapebody.files import atomic_write
+
+        notes = "".join(f"\n  - {note}" for note in self.inferred).replace("--", "- -")
+        comment = f"<!-- Completed from {self.path.name}:{notes}\n-->\n" if notes else ""
+        return atomic_write(path, comment + self.robot.xml)
+
+    def __str__(self) -> str:
+        verdict = "can be used" if self.ok else "cannot be used yet"
+        parts = [f"{self.path}: {verdict}"]
+        if self.summary:
+            width = max(map(len, self.summary))
+            parts.append(
+                "\n".join(f"  {label:{width}s}  {value}" for label, value in self.summary.items())
+            )
+        for title, items in (
+            ("Problems", self.problems),
+            ("Inferred", self.inferred),
+            ("Warnings", self.warnings),
+        ):
+            if items:
+                lines = [
+                    textwrap.fill(
+                        item,
+                        width=98,
+                        initial_indent="  - ",
+                        subsequent_indent="    ",
+                        break_on_hyphens=False,
+                        break_long_words=False,
+                    )
+                    for item in items
+                ]
+                parts.append("\n".join([f"{title} ({len(items)})", *lines]))
+        return "\n\n".join(parts)
+
+    __repr__ = __str__
+
+
+def validate_robot(name_or_path: str | Path) -> Report:
+    """Report on a robot file (MJCF or URDF), or a robot of `robots()`.
+
+    Everything that `load_robot` would raise for the file is a problem of the report; only a value
+    that is neither a name nor a path raises TypeError. Takes well under a second without meshes.
+    """
+    path = Path(name_or_path)
+    try:
+        path = find(name_or_path)
+        robot, problems, inferred = examine(path)
+    except (ValueError, OSError) as error:
+        return Report(path, None, (str(error),), (), ())
+    if robot is None:
+        return Report(path, None, tuple(problems), inferred, ())
+    held = hold(robot)
+    warnings = [message for check in WARNINGS for message in check(robot, held)]
+    return Report(path, robot, (), inferred, tuple(warnings), _summary(robot, held))
+
+
+@dataclass(frozen=True)
+class Held:
+    """The robot after some time in its nominal pose under its own gains."""
+
+    finite: bool
+    """False if the simulation failed."""
+    sunk: float
+    """How far the trunk sank, as a share of its height."""
+    tilt: float
+    """Largest angle of the trunk from its home orientation, rad."""
+    touching: np.ndarray
+    """bool[nf], feet that touched the floor at some time."""
+    saturated: np.ndarray
+    """float[nu], share of the time at the torque limit."""
+
+
+def hold(robot: Robot, seconds: float = 1.0) -> Held:
+    """Simulate the nominal pose with constant targets in the C engine."""
+    model, data = robot.model, mujoco.MjData(robot.model)
+    data.qpos[:] = robot.home
+    data.ctrl[:] = robot.nominal
+    mujoco.mj_forward(model, data)
+    height = data.xpos[robot.trunk, 2]
+    up = data.xmat[robot.trunk].reshape(3, 3)[2].copy()
+    lowest, tilt = height, 0.0
+    touching = np.zeros(robot.num_feet, bool)
+    saturated = np.zeros(robot.num_actuators)
+    limits = model.actuator_forcerange[:, 1]
+    steps = max(1, round(seconds / model.opt.timestep))
+    for _ in range(steps):
+        mujoco.mj_step(model, data)
+        lowest = min(lowest, data.xpos[robot.trunk, 2])
+        cosine = data.xmat[robot.trunk].reshape(3, 3)[2] @ up
+        tilt = max(tilt, float(np.arccos(np.clip(cosine, -1, 1))))
+        geoms = data.contact.geom[: data.ncon].ravel()
+        touching |= np.isin(robot.feet, geoms)
+        saturated += np.abs(data.actuator_force) >= 0.999 * limits
+    failures = (mujoco.mjtWarning.mjWARN_BADQPOS, mujoco.mjtWarning.mjWARN_BADQACC)
+    failed = any(data.warning[int(kind)].number for kind in failures)
+    finite = bool(np.isfinite(data.qpos).all()) and not failed
+    return Held(finite, float(1 - lowest / height), tilt, touching, saturated / steps)
+
+
+# Warnings. Each takes the robot and `Held` and yields one message per finding.
+
+
+def warn_standing(robot: Robot, held: Held) -> Iterator[str]:
+    """Does it stand for a second?"""
+    if not held.finite:
+        yield (
+            "the simulation of the nominal pose becomes unstable within 1 s: the gains are too "
+            f"high for the smallest inertias (kp {robot.p_gain:g}, kv {robot.d_gain:g}); lower "
+            "them, or add armature to the joints"
+        )
+    elif held.tilt > np.radians(30) or held.sunk > 0.35:
+        yield (
+            f"it falls out of its nominal pose: within 1 s the trunk sinks by {held.sunk:.0%} of "
+            f"its height and tilts by {np.degrees(held.tilt):.0f} degrees. With gains as soft as "
+            "the paper's that is usual (many of its robots do, the Go2 among them) and the policy "
+            'learns to hold it; but see that "home", kp and the torque limits are as meant'
+        )
+    if held.finite and not held.touching.all():
+        feet = _names(robot.model.geom(int(i)).name for i in robot.feet[~held.touching])
+        yield f'feet {feet} do not touch the floor in the nominal pose: correct "home" or the feet'
+
+
+def warn_torque(robot: Robot, held: Held) -> Iterator[str]:
+    """Torque limits against the robot's own weight."""
+    model, data = robot.model, mujoco.MjData(robot.model)
+    data.qpos[:] = robot.home
+    mujoco.mj_forward(model, data)
+    weight = -model.body_mass[1:].sum() * model.opt.gravity / robot.num_feet
+    needed = np.zeros(model.nv)
+    for foot, body in zip(robot.feet, robot.foot_bodies, strict=True):
+        jacobian = np.zeros((3, model.nv))
+        mujoco.mj_jac(model, data, jacobian, None, data.geom_xpos[foot], int(body))
+        needed += jacobian.T @ weight
+    needed = np.abs(needed[robot.qvel_index])
+    limits = model.actuator_forcerange[:, 1]
+    for i in np.flatnonzero(needed > limits):
+        yield (
+            f"actuator {model.actuator(int(i)).name!r} is too weak to stand: about {needed[i]:.3g} "
+            f"N m with the weight on all feet, limit {limits[i]:.3g} N m"
+        )
+    usual = leg_torque(model)
+    high = np.flatnonzero(limits > 20 * usual)
+    if len(high):
+        yield (
+            f"torque limits of {_names(model.actuator(int(i)).name for i in high)} are up to "
+            f"{limits.max():.3g} N m, over 20 times what a robot of this weight and leg length has "
+            f"({usual:.3g} N m): a placeholder? Correct forcerange (in a URDF, effort)"
+        )
+
+
+def warn_limits(robot: Robot, held: Held) -> Iterator[str]:
+    """Joint limits under design, and the nominal pose within them."""
+    model = robot.model
+    low, high = model.jnt_range[robot.joints].T
+    narrow = [model.joint(int(j)).name for j in robot.joints[high - low < RANGE_CHANGE]]
+    if narrow:
+        yield (
+            f"joints {_names(narrow)} have ranges below {RANGE_CHANGE:g} rad: designs can make "
+            "their limits cross, which holds the joint about the middle"
+        )
+    low, high = model.jnt_range[robot.joints[robot.actuated]].T
+    outside = np.flatnonzero((robot.nominal < low) | (robot.nominal > high))
+    if len(outside):
+        names = _names(model.actuator(int(i)).name for i in outside)
+        yield f'"home" is outside the joint limits at {names}: correct the keyframe or the range'
+    middle, half = (high + low) / 2, 0.45 * (high - low)
+    near = np.abs(robot.nominal - middle) > half + 1e-6
+    near[outside] = False
+    if near.any():
+        names = _names(model.actuator(int(i)).name for i in np.flatnonzero(near))
+        yield (
+            f'"home" is in the outer 5 % of the range at {names}: designs clip nominal positions '
+            "to the inner 90 %, the reference included"
+        )
+
+
+def warn_plausibility(robot: Robot, held: Held) -> Iterator[str]:
+    """Sizes, gravity, damping, self-collision."""
+    model = robot.model
+    mass, height = model.body_mass[1:].sum(), robot.home[2]
+    if not 0.1 < mass < 300 or not 0.03 < height < 3:
+        yield f"{mass:.3g} kg and a trunk {height:.3g} m high: are the units kg and m?"
+    if not np.allclose(model.opt.gravity, [0, 0, -9.81], atol=0.05):
+        yield f"gravity is {model.opt.gravity}: expected 0 0 -9.81"
+    gap = _gap(robot)
+    if abs(gap) > FLOOR_TOLERANCE * height:
+        yield f'the lowest foot of "home" is {gap:+.3f} m from the floor: correct the trunk height'
+    if robot.d_gain == 0:
+        yield (
+            "the D gain (kv) is 0: the joints are damped by <joint damping> alone, and designs "
+            "cannot change a D gain of 0; give kv"
+        )
+    if robot.num_spheres == 0:
+        yield (
+            "no collision spheres: self-collision is not penalized; add sphere geoms of group 5 "
+            'where parts can meet, e.g. <geom type="sphere" size="0.05" group="5"/>'
+        )
+
+
+def _gap(robot: Robot) -> float:
+    from shapebody.mjcf import standing_pose
+
+    return float(robot.home[2] - standing_pose(robot, robot.model, robot.nominal)[2])
+
+
+WARNINGS = (warn_standing, warn_torque, warn_limits, warn_plausibility)
+
+
+def _summary(robot: Robot, held: Held) -> dict[str, str]:
+    model = robot.model
+    feet = [
+        f"{model.geom(int(i)).name} ({'box' if kind else 'sphere'})"
+        for i, kind in zip(robot.feet, robot.foot_types, strict=True)
+    ]
+    limits = model.actuator_forcerange[:, 1]
+
+    def span(values, unit):
+        low, high = values.min(), values.max()
+        return f"{low:.3g} {unit}" if low == high else f"{low:.3g} to {high:.3g} {unit}"
+
+    return {
+        "robot": f"{robot.display_name} ({robot.morphology})",
+        "bodies": f"{robot.num_bodies}, trunk {model.body(robot.trunk).name!r}",
+        "joints": f"{robot.num_joints} hinges, {robot.num_actuators} driven, "
+        f"{int(robot.keep_nominal.sum())} of them should keep their nominal position",
+        "feet": f"{robot.num_feet}: {_names(feet)}",
+        "mass": f"{model.body_mass[1:].sum():.4g} kg",
+        "height": f"{robot.home[2]:.4g} m, trunk above the floor",
+        "gains": f"kp {robot.p_gain:g} N m/rad, kv {robot.d_gain:g} N m s/rad, "
+        f"action scale {robot.action_scale:g} rad",
+        "torque limits": span(limits, "N m"),
+        "velocity limits": span(robot.velocity_limits, "rad/s"),
+        "standing": f"after 1 s sunk by {max(0, held.sunk):.0%}, tilted by "
+        f"{np.degrees(held.tilt):.0f} degrees",
+        "design": f"d = {robot.design_dim} parameters",
+    }
+
+
+def _names(names) -> str:
+    """Names for a message; of many, the first ones and how many more."""
+    names = list(names)
+    more = f" and {len(names) - 6} more" if len(names) > 6 else ""
+    return ", ".join(map(str, names[:6])) + more
