@@ -13,8 +13,11 @@ from pathlib import Path
 import mujoco
 import numpy as np
 
-from shapebody.inference import COLLISION_GROUP, complete, read
+from shapebody.feet import foot_ids
+from shapebody.inference import complete
 from shapebody.paths import data_dir
+from shapebody.reading import read
+from shapebody.specs import COLLISION_GROUP
 
 FOOT_SPHERE, FOOT_BOX = 0, 1
 PAIR_FRICTION = (1.0, 1.0, 0.005, 0.0001, 0.0001)
@@ -323,7 +326,7 @@ def check_actuators(model: mujoco.MjModel) -> Iterator[str]:
 
 def check_feet(model: mujoco.MjModel) -> Iterator[str]:
     """Feet. Asked of the completed model."""
-    if len(_foot_ids(model)) == 0:
+    if len(foot_ids(model)) == 0:
         yield (
             'no geom has "foot" in its name, and no leg ends in a geom that could be a foot: '
             "expected one sphere or box per foot; add them where the robot touches the floor, e.g. "
@@ -385,11 +388,6 @@ def _shown(values: np.ndarray) -> str:
     return np.array2string(values, threshold=6)
 
 
-def _foot_ids(model: mujoco.MjModel) -> np.ndarray:
-    names = (mujoco.mj_id2name(model, _OBJ.mjOBJ_GEOM, i) or "" for i in range(model.ngeom))
-    return np.array([i for i, name in enumerate(names) if "foot" in name.lower()], dtype=int)
-
-
 def _numeric(model: mujoco.MjModel, name: str) -> np.ndarray | None:
     index = mujoco.mj_name2id(model, _OBJ.mjOBJ_NUMERIC, name)
     if index < 0:
@@ -411,7 +409,7 @@ def _text(model: mujoco.MjModel, name: str, default: str) -> str:
 
 def _layout(model: mujoco.MjModel) -> dict[str, list[tuple]]:
     """Block name -> sensors (name, type, object type, object name) in order."""
-    feet = [model.geom(i).name for i in _foot_ids(model)]
+    feet = [model.geom(i).name for i in foot_ids(model)]
     spheres = [model.geom(i).name for i in np.flatnonzero(model.geom_group == COLLISION_GROUP)]
     actuators = [model.actuator(i).name for i in range(model.nu)]
     imu = {
@@ -470,7 +468,7 @@ def _add_sensors(spec: mujoco.MjSpec, model: mujoco.MjModel) -> bool:
         frozenset(pair)
         for pair in zip(model.pair_geom1.tolist(), model.pair_geom2.tolist(), strict=True)
     }
-    for foot in _foot_ids(model):
+    for foot in foot_ids(model):
         if frozenset((floor, int(foot))) not in paired:
             name = mujoco.mj_id2name(model, _OBJ.mjOBJ_GEOM, int(foot))
             spec.add_pair(geomname1="floor", geomname2=name, condim=3, friction=PAIR_FRICTION)
@@ -481,7 +479,7 @@ def _add_sensors(spec: mujoco.MjSpec, model: mujoco.MjModel) -> bool:
 def _read(name: str, path: Path | None, xml: str, model: mujoco.MjModel, inferred) -> Robot:
     joints = np.flatnonzero(model.jnt_type == _JOINT.mjJNT_HINGE)
     actuated = np.searchsorted(joints, model.actuator_trnid[:, 0])
-    feet = _foot_ids(model)
+    feet = foot_ids(model)
     home = np.array(model.key_qpos[mujoco.mj_name2id(model, _OBJ.mjOBJ_KEY, "home")])
     keep = _numeric(model, "keep_nominal")
     legs = {2: "biped", 4: "quadruped", 6: "hexapod"}.get(len(feet), f"{len(feet)} feet")

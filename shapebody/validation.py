@@ -12,6 +12,7 @@ import numpy as np
 
 from shapebody.inference import FLOOR_TOLERANCE, leg_torque
 from shapebody.robots import Robot, examine, find
+from shapebody.specs import listed
 
 RANGE_CHANGE = 0.8  # rad: in a design both limits of a joint can move towards each other by half
 
@@ -171,7 +172,7 @@ def warn_standing(robot: Robot, held: Held) -> Iterator[str]:
             'learns to hold it; but see that "home", kp and the torque limits are as meant'
         )
     if held.finite and not held.touching.all():
-        feet = _names(robot.model.geom(int(i)).name for i in robot.feet[~held.touching])
+        feet = listed(robot.model.geom(int(i)).name for i in robot.feet[~held.touching])
         yield f'feet {feet} do not touch the floor in the nominal pose: correct "home" or the feet'
 
 
@@ -197,7 +198,7 @@ def warn_torque(robot: Robot, held: Held) -> Iterator[str]:
     high = np.flatnonzero(limits > 20 * usual)
     if len(high):
         yield (
-            f"torque limits of {_names(model.actuator(int(i)).name for i in high)} are up to "
+            f"torque limits of {listed(model.actuator(int(i)).name for i in high)} are up to "
             f"{limits.max():.3g} N m, over 20 times what a robot of this weight and leg length has "
             f"({usual:.3g} N m): a placeholder? Correct forcerange (in a URDF, effort)"
         )
@@ -210,19 +211,19 @@ def warn_limits(robot: Robot, held: Held) -> Iterator[str]:
     narrow = [model.joint(int(j)).name for j in robot.joints[high - low < RANGE_CHANGE]]
     if narrow:
         yield (
-            f"joints {_names(narrow)} have ranges below {RANGE_CHANGE:g} rad: designs can make "
+            f"joints {listed(narrow)} have ranges below {RANGE_CHANGE:g} rad: designs can make "
             "their limits cross, which holds the joint about the middle"
         )
     low, high = model.jnt_range[robot.joints[robot.actuated]].T
     outside = np.flatnonzero((robot.nominal < low) | (robot.nominal > high))
     if len(outside):
-        names = _names(model.actuator(int(i)).name for i in outside)
+        names = listed(model.actuator(int(i)).name for i in outside)
         yield f'"home" is outside the joint limits at {names}: correct the keyframe or the range'
     middle, half = (high + low) / 2, 0.45 * (high - low)
     near = np.abs(robot.nominal - middle) > half + 1e-6
     near[outside] = False
     if near.any():
-        names = _names(model.actuator(int(i)).name for i in np.flatnonzero(near))
+        names = listed(model.actuator(int(i)).name for i in np.flatnonzero(near))
         yield (
             f'"home" is in the outer 5 % of the range at {names}: designs clip nominal positions '
             "to the inner 90 %, the reference included"
@@ -278,7 +279,7 @@ def _summary(robot: Robot, held: Held) -> dict[str, str]:
         "bodies": f"{robot.num_bodies}, trunk {model.body(robot.trunk).name!r}",
         "joints": f"{robot.num_joints} hinges, {robot.num_actuators} driven, "
         f"{int(robot.keep_nominal.sum())} of them should keep their nominal position",
-        "feet": f"{robot.num_feet}: {_names(feet)}",
+        "feet": f"{robot.num_feet}: {listed(feet)}",
         "mass": f"{model.body_mass[1:].sum():.4g} kg",
         "height": f"{robot.home[2]:.4g} m, trunk above the floor",
         "gains": f"kp {robot.p_gain:g} N m/rad, kv {robot.d_gain:g} N m s/rad, "
@@ -289,10 +290,3 @@ def _summary(robot: Robot, held: Held) -> dict[str, str]:
         f"{np.degrees(held.tilt):.0f} degrees",
         "design": f"d = {robot.design_dim} parameters",
     }
-
-
-def _names(names) -> str:
-    """Names for a message; of many, the first ones and how many more."""
-    names = list(names)
-    more = f" and {len(names) - 6} more" if len(names) > 6 else ""
-    return ", ".join(map(str, names[:6])) + more

@@ -1,0 +1,131 @@
+"""Small edits of an MjSpec that keep what refers to the edited elements."""
+
+import re
+
+import mujoco
+import numpy as np
+
+COLLISION_GROUP = 5
+FOOT = re.compile("foot", re.IGNORECASE)
+
+_GEOM, _JOINT = mujoco.mjtGeom, mujoco.mjtJoint
+# Integers compare equal with what models hold and with what specs hold.
+MESHES = tuple(map(int, (_GEOM.mjGEOM_MESH, _GEOM.mjGEOM_HFIELD, _GEOM.mjGEOM_SDF)))
+
+
+def unused(name: str, taken) -> str:
+    """The name, with a number if it is taken."""
+    candidates = [name, *(f"{name}_{i}" for i in range(2, len(taken) + 3))]
+    return next(candidate for candidate in candidates if candidate not in taken)
+
+
+def listed(names) -> str:
+    """Names for a message; of many, the first ones and how many more."""
+    shown = [str(name) or "(unnamed)" for name in names]
+    more = f" and {len(shown) - 6} more" if len(shown) > 6 else ""
+    return ", ".join(shown[:6]) + more
+
+
+def ordered(elements) -> list:
+    """Elements of a compiled spec in the order of the model."""
+    return sorted(elements, key=lambda element: element.id)
+
+
+def name_parts(spec):
+    """Name what other elements refer to and MJCF leaves optional."""
+    taken = {joint.name for joint in spec.joints}
+    for index, joint in enumerate(spec.joints):
+        if not joint.name and joint.type != _JOINT.mjJNT_FREE:
+            joint.name = unused(f"joint_{index}", taken)
+            taken.add(joint.name)
+    spheres = [geom for geom in spec.geoms if geom.group == COLLISION_GROUP]
+    for index, geom in enumerate(spheres):
+        geom.name = geom.name or f"sphere_{index}"
+    for actuator in spec.actuators:
+        actuator.name = actuator.name or actuator.target
+
+
+def write_inertial(body, model):
+    """Make the inertial of a body explicit, as it was compiled."""
+    body.explicitinertial = True
+    body.mass = model.body_mass[body.id]
+    body.ipos = model.body_ipos[body.id]
+    body.iquat = model.body_iquat[body.id]
+    body.inertia = model.body_inertia[body.id]
+    body.fullinertia = np.full(6, np.nan)
+
+
+def replace_geom(spec, geom, kind, size, position, quaternion):
+    """A new geom in the place of another one, with its name and looks, posed in the body frame."""
+    new = geom.parent.add_geom(type=kind, size=size, pos=position, quat=quaternion)
+    for name in ("group", "rgba", "material", "contype", "conaffinity"):
+        setattr(new, name, getattr(geom, name))
+    name = geom.name
+    spec.delete(geom)
+    new.name = name
+    return new
+
+
+def _references(spec):
+    """Attributes of other elements that name geoms."""
+    for pair in spec.pairs:
+        yield pair, "geomname1"
+        yield pair, "geomname2"
+    for sensor in spec.sensors:
+        if sensor.objtype == mujoco.mjtObj.mjOBJ_GEOM:
+            yield sensor, "objname"
+        if sensor.reftype == mujoco.mjtObj.mjOBJ_GEOM:
+            yield sensor, "refname"
+
+
+def rename_geom(spec, geom, name: str):
+    """Rename a geom, and in what refers to it."""
+    old = geom.name
+    geom.name = name
+    for element, attribute in _references(spec) if old else ():
+        if getattr(element, attribute) == old:
+            setattr(element, attribute, name)
+
+
+def rename_site(spec, site, name: str):
+    """Rename a site, and in the sensors that refer to it."""
+    for sensor in spec.sensors:
+        if sensor.objtype == mujoco.mjtObj.mjOBJ_SITE and sensor.objname == site.name:
+            sensor.objname = name
+    site.name = name
+
+
+def drop_geom(spec, geom):
+    """Delete a geom and what refers to it."""
+    dangling = [
+        element
+        for element, attribute in _references(spec)
+        if geom.name and getattr(element, attribute) == geom.name
+    ]
+    for element in {id(element): element for element in dangling}.values():
+        spec.delete(element)
+    spec.delete(geom)
+
+
+def add_floor(spec) -> str:
+    """Add the floor; returns the note that says so."""
+    spec.worldbody.add_geom(
+        name="floor", type=_GEOM.mjGEOM_PLANE, size=[0, 0, 0.05], contype=0, conaffinity=0
+    )
+    return (
+        "no floor: a plane at z = 0 is added; to say it yourself add "
+        '<geom name="floor" type="plane" size="0 0 0.05" contype="0" conaffinity="0"/>'
+    )
+
+
+def drop_assets(spec) -> int:
+    """Delete meshes, height fields, skins and image files; returns how many."""
+    files = [texture for texture in spec.textures if texture.file or any(texture.cubefiles)]
+    names = {texture.name for texture in files}
+    for material in spec.materials:
+        if names & set(material.textures):
+            material.textures = [""] * len(material.textures)
+    assets = [*spec.meshes, *spec.hfields, *spec.skins, *files]
+    for asset in assets:
+        spec.delete(asset)
+    return len(assets)
