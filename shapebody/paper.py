@@ -1,9 +1,9 @@
 """Numbers of the paper "Shape Your Body", for tables and figures "paper | ours".
 
-Values in `TRUST_REGION`, `CRITIC_ABLATION`, `COUNTERFACTUAL`, `PARAMETERS`, `LAYERS` and `PPO` are
-printed in the paper. `SINGLE_ROBOT`, `TRAINING_SETS` and `RL_CODESIGN` were read off its figures
-by eye, each to about ±`READING_ERROR`. ΔR is R(f*) - R(f_init), the mean over ten starts; returns
-are undiscounted sums over an episode.
+Values in `ROBOT_TABLE`, `TRUST_REGION`, `CRITIC_ABLATION`, `COUNTERFACTUAL`, `PARAMETERS`,
+`LAYERS` and `PPO` are printed in the paper. `SINGLE_ROBOT`, `TRAINING_SETS` and `RL_CODESIGN` were
+read off its figures by eye, each to about ±`READING_ERROR`. ΔR is R(f*) - R(f_init), the mean over
+ten starts; returns are undiscounted sums over an episode.
 """
 
 ROBOTS = ("unitree_go2", "mit_humanoid", "golem")
@@ -232,3 +232,58 @@ def trust_region_gain(robot: str, trust_region: float) -> float | None:
     if robot not in TRUST_REGION or trust_region not in LAMBDAS:
         return None
     return TRUST_REGION[robot][LAMBDAS.index(trust_region)]
+
+
+ROBOT_TABLE = {
+    "unitree_a1": (20.0, 0.5, 0.25, 12, 358),
+    "unitree_go1": (20.0, 0.5, 0.25, 12, 358),
+    "unitree_go2": (20.0, 0.5, 0.3, 12, 358),
+    "unitree_b2": (80.0, 2.0, 0.5, 12, 358),
+    "anymal_b": (80.0, 2.0, 0.5, 12, 358),
+    "anymal_c": (80.0, 2.0, 0.5, 12, 358),
+    "barkour_v0": (20.0, 0.5, 0.25, 12, 358),
+    "barkour_vb": (30.0, 0.5, 0.25, 12, 358),
+    "silver_badger": (20.0, 0.5, 0.25, 13, 385),
+    "honey_badger": (20.0, 0.5, 0.25, 12, 358),
+    "bittle": (25.0, 0.5, 0.6, 8, 250),
+    "aibo": (20.0, 0.5, 0.25, 17, 493),
+    "solo12": (20.0, 0.5, 0.25, 12, 358),
+    "spot": (80.0, 2.0, 0.5, 12, 358),
+    "spot_mini": (20.0, 0.5, 0.25, 12, 358),
+    "bolt": (15.0, 0.3, 0.2, 6, 190),
+    "open_duck_mini": (6.5, 0.5, 0.5, 16, 460),
+    "mini_pi": (20.0, 0.5, 0.3, 12, 352),
+    "qmini": (15.0, 1.0, 0.4, 10, 298),
+    "tron1": (40.0, 1.0, 0.5, 6, 190),
+    "unitree_h1": (60.0, 2.0, 0.75, 19, 541),
+    "unitree_g1": (45.0, 1.0, 0.5, 23, 985),
+    "talos": (80.0, 2.0, 0.75, 30, 1020),
+    "robotis_op3": (21.0, 0.5, 0.6, 20, 568),
+    "nao_v5": (30.0, 1.0, 0.7, 22, 1102),
+    "adam_lite": (80.0, 2.0, 0.75, 25, 703),
+    "agibot_x1": (45.0, 1.0, 0.7, 29, 811),
+    "apptronik_apollo": (100.0, 2.0, 0.75, 30, 890),
+    "atlas": (80.0, 2.0, 0.75, 27, 783),
+    "berkeley_humanoid": (20.0, 0.6, 0.5, 12, 352),
+    "berkeley_humanoid_lite": (20.0, 0.5, 0.3, 22, 661),
+    "booster_t1": (25.0, 0.6, 0.5, 23, 649),
+    "elf2": (35.0, 0.7, 0.5, 25, 703),
+    "engineai_sa01": (55.0, 1.5, 0.5, 12, 352),
+    "fourier_gr1t2": (80.0, 2.0, 0.75, 34, 946),
+    "fourier_gr2v3": (80.0, 2.0, 0.75, 29, 811),
+    "fourier_n1": (70.0, 2.0, 0.7, 23, 649),
+    "kbot_v1": (40.0, 2.0, 0.5, 20, 594),
+    "kbot_v2": (50.0, 1.0, 0.5, 20, 594),
+    "mit_humanoid": (30.0, 0.5, 0.5, 18, 514),
+    "northwestern_humanoid": (20.0, 0.6, 0.5, 10, 298),
+    "poppy_humanoid": (20.0, 0.5, 0.3, 25, 703),
+    "sigmaban": (21.0, 0.5, 0.5, 20, 568),
+    "star1": (80.0, 2.0, 0.75, 31, 1177),
+    "valkyrie": (100.0, 2.0, 0.75, 26, 730),
+    "zbot": (10.0, 0.5, 0.4, 20, 594),
+    "crab": (20.0, 0.5, 0.5, 18, 526),
+    "custom_hexapod": (30.0, 0.5, 0.6, 18, 526),
+    "tom_hexapod": (25.0, 0.5, 0.5, 18, 526),
+    "golem": (25.0, 0.5, 0.5, 24, 688),
+}
+"""The 50 robots (Appendix A): name: (p-gain, d-gain, σ_robot, n_u, d_design)."""

@@ -29,8 +29,6 @@ import numpy as np
 import optax
 
 from shapebody.checkpoints import Agent, atomic_write, load_arrays, save_agent, save_arrays
-from shapebody.descriptions import describe
-from shapebody.design import DesignSpace
 from shapebody.locomotion import Locomotion, TaskConfig, Trajectory
 from shapebody.networks import (
     Critic,
@@ -133,7 +131,7 @@ class TrainConfig:
                 "minibatch_size": 2048,
                 "epochs": 3,
                 "total_steps": 50_000_000,
-                "learning_rate": (1e-3, 3e-4),
+                "learning_rate": (1e-3, 1e-4),
                 **changes,
             }
         )
@@ -449,7 +447,7 @@ class Trainer:
         self.act = make_policy_function(self.policy)
         keys = jax.random.split(jax.random.PRNGKey(config.seed), 4)
         self.key = keys[0]
-        constants = self._constants(keys[1], robots) if config.standardize else None
+        constants = self._constants(keys[1]) if config.standardize else None
         if policy is None:
             policy = initialize(self.policy, keys[2], constants)
         self.learner = start(policy, initialize(self.critic, keys[3], constants))
@@ -459,15 +457,13 @@ class Trainer:
         self.state = None
         self.saved_physics = None
 
-    def _constants(self, key, robots):
+    def _constants(self, key):
         """Input standardization over the designs of all robots."""
         batches = []
-        for i, robot in enumerate(robots):
-            space, to_descriptions = DesignSpace(robot), describe(robot)
+        for i, robot in enumerate(self.env.robots):
             keys = jax.random.fold_in(key, i)
-            f = jax.random.uniform(keys, (512, space.dim), minval=-1.0, maxval=1.0)
-            embodiments = jax.jit(jax.vmap(space))(f)
-            batches.append(jax.jit(jax.vmap(to_descriptions))(embodiments))
+            f = jax.random.uniform(keys, (512, robot.design_dim), minval=-1.0, maxval=1.0)
+            batches.append(self.env.descriptions(i, f))
         return standardization(*batches)
 
     # -------------------------------------------------------------- state on disk
