@@ -44,17 +44,20 @@ def leg_ends(model, qpos) -> dict[int, list[int]]:
         touching = [i for i in shapes if model.geom_contype[i] or model.geom_conaffinity[i]]
         group = touching or shapes
         if group:
-            bottom = np.array([lowest(model, data, i) for i in group])
-            heights[body], chosen[body] = bottom.min(), (np.array(group), bottom)
+            chosen[body] = lowest_geoms(model, data, group)
+            heights[body] = lowest(model, data, chosen[body][0])
     if not heights:
         return {}
     floor = min(heights.values())
     height = data.xpos[1, 2] - floor
-    return {
-        body: [int(i) for i in group[bottom <= heights[body] + 0.02 * height]]
-        for body, (group, bottom) in chosen.items()
-        if heights[body] <= floor + 0.2 * height
-    }
+    return {body: group for body, group in chosen.items() if heights[body] <= floor + 0.2 * height}
+
+
+def lowest_geoms(model, data, group) -> list[int]:
+    """The geoms of a group that are as low as the lowest, up to 2 % of the height of the trunk."""
+    bottom = {int(i): lowest(model, data, i) for i in group}
+    least = min(bottom.values())
+    return [i for i in bottom if bottom[i] <= least + 0.02 * (data.xpos[1, 2] - least)]
 
 
 def lowest(model, data, geom: int) -> float:

@@ -22,6 +22,7 @@ from shapebody.feet import (
     leg_ends,
     leg_length,
     lowest,
+    lowest_geoms,
     shape_name,
     solid,
 )
@@ -205,7 +206,9 @@ def infer_feet(spec, model) -> Iterator[str]:
         return
     data = _home_data(model)
     if named:
-        groups = {body: solid(model, group) for body, group in named.items()}
+        groups = {
+            body: lowest_geoms(model, data, solid(model, group)) for body, group in named.items()
+        }
     else:
         groups = leg_ends(model, data.qpos)
     labels = {group[0]: foot_name(geoms, group) for group in groups.values()}

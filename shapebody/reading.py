@@ -25,6 +25,7 @@ from shapebody.specs import (
 )
 
 VELOCITY_LIMIT = 15.0  # rad/s, the median over the 50 robots of their median joint
+ARMATURE = 0.01  # kg m², the median of the 50 robots; 76 % are within a factor 2
 IMU = re.compile("imu", re.IGNORECASE)
 
 _GEOM, _JOINT = mujoco.mjtGeom, mujoco.mjtJoint
@@ -190,6 +191,15 @@ def _float(spec, model, text, notes) -> mujoco.MjModel:
         names = listed([body.name for body in fixed])
         notes.append(f"links {names} are fixed: merged into the links that carry them")
         spec.fuse_static()
+    hinges = [joint for joint in spec.joints if joint.type == _JOINT.mjJNT_HINGE]
+    for joint in hinges:
+        joint.armature = joint.armature or ARMATURE
+    if hinges:
+        notes.append(
+            f"URDF has no armature: {ARMATURE:g} kg m² for every joint, the inertia of its motor "
+            "as the joint feels it; to say it yourself write the completed file and edit <joint "
+            'armature="..."/>'
+        )
     model = _compile(spec, notes)
     speeds = _urdf_velocities(text)
     hinges = [joint.name for joint in ordered(spec.joints) if joint.type == _JOINT.mjJNT_HINGE]

@@ -139,17 +139,18 @@ def hold(robot: Robot, seconds: float = 1.0) -> Held:
     saturated = np.zeros(robot.num_actuators)
     limits = model.actuator_forcerange[:, 1]
     steps = max(1, round(seconds / model.opt.timestep))
+    finite = True
     for _ in range(steps):
         mujoco.mj_step(model, data)
+        finite = bool(np.all(np.abs(data.qvel) < 1e4))  # false for NaN
+        if not finite:
+            break
         lowest = min(lowest, data.xpos[robot.trunk, 2])
         cosine = data.xmat[robot.trunk].reshape(3, 3)[2] @ up
         tilt = max(tilt, float(np.arccos(np.clip(cosine, -1, 1))))
         geoms = data.contact.geom[: data.ncon].ravel()
         touching |= np.isin(robot.feet, geoms)
         saturated += np.abs(data.actuator_force) >= 0.999 * limits
-    failures = (mujoco.mjtWarning.mjWARN_BADQPOS, mujoco.mjtWarning.mjWARN_BADQACC)
-    failed = any(data.warning[int(kind)].number for kind in failures)
-    finite = bool(np.isfinite(data.qpos).all()) and not failed
     return Held(finite, float(1 - lowest / height), tilt, touching, saturated / steps)
 
 
@@ -287,6 +288,8 @@ def _summary(robot: Robot, held: Held) -> dict[str, str]:
         "torque limits": span(limits, "N m"),
         "velocity limits": span(robot.velocity_limits, "rad/s"),
         "standing": f"after 1 s sunk by {max(0, held.sunk):.0%}, tilted by "
-        f"{np.degrees(held.tilt):.0f} degrees",
+        f"{np.degrees(held.tilt):.0f} degrees"
+        if held.finite
+        else "the simulation becomes unstable",
         "design": f"d = {robot.design_dim} parameters",
     }

@@ -295,6 +295,11 @@ FEET = {
         ),
         (1, [0.08, 0.04, 0.01], -0.2),
     ),
+    "ball and its adapter, both named foot": (
+        '<geom name="{leg}_foot_adapter" class="collision" type="cylinder" size="0.01 0.05"/>'
+        '<geom name="{leg}_foot" class="foot"/>',
+        (0, [0.022], -0.2),
+    ),
     "ball named foot, and a mesh too": (
         '<geom name="{leg}_foot_look" mesh="hip" class="visual"/>'
         '<geom name="{leg}_foot" class="foot"/>',
@@ -386,6 +391,7 @@ def test_biped_urdf(tmp_path):
     np.testing.assert_allclose(model.geom_size[robot.feet], [[0.1, 0.04, 0.01]] * 2)
     np.testing.assert_array_equal(model.actuator_forcerange[:, 1], 60)
     np.testing.assert_array_equal(robot.velocity_limits, 12)
+    np.testing.assert_array_equal(model.dof_armature[6:], 0.01)
     np.testing.assert_allclose(model.site_pos[robot.imu_site], [0.05, 0, 0.1])
     kept = {model.actuator(int(i)).name for i in np.flatnonzero(robot.keep_nominal)}
     assert kept == {"shoulder"}

@@ -115,6 +115,8 @@ def test_holding_the_nominal_pose(tmp_path):
     assert stands.finite and stands.sunk < 0.2 and stands.tilt < 0.1 and stands.touching.all()
     falls = hold(load_robot("unitree_go2"))  # with the paper's soft gains
     assert falls.finite and falls.sunk > 0.35
+    wild = (LIMITS, LIMITS.replace("20", "2e6").replace("9", "1e5"))
+    assert not hold(load_robot(own_robot(tmp_path, wild))).finite
     weak = own_robot(tmp_path, (LIMITS, LIMITS.replace("9", "0.01")))
     held = hold(load_robot(weak))
     assert held.sunk > 0.35 and held.saturated.max() > 0.5
