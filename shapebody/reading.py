@@ -46,6 +46,11 @@ def read(path: Path) -> tuple[str, mujoco.MjSpec, mujoco.MjModel, list[str]]:
         ) from error
     if not text.strip():
         raise ValueError(f"{path} is empty: expected an MJCF or URDF file; write the robot to it")
+    if "<xacro:" in text:
+        raise ValueError(
+            f"{path} is a xacro template: expected a URDF; expand it first with "
+            "'xacro FILE > robot.urdf', where ROS is installed"
+        )
     root = re.search(r"<([A-Za-z_][\w:.-]*)", re.sub(r"<!--.*?-->", "", text, flags=re.DOTALL))
     urdf = root.group(1) == "robot" if root else path.suffix == ".urdf"
     notes = []
@@ -248,7 +253,11 @@ def _feet_of_links(spec, fixed) -> Iterator[str]:
 def _urdf_velocities(text: str) -> dict[str, float]:
     """Velocity limits > 0 by joint; MuJoCo's importer has no place for them."""
     speeds = {}
-    for joint in ElementTree.fromstring(text).iter("joint"):
+    try:
+        root = ElementTree.fromstring(text)
+    except ElementTree.ParseError:  # MuJoCo's parser is more lenient
+        return {}
+    for joint in root.iter("joint"):
         limit = joint.find("limit")
         if limit is not None and float(limit.get("velocity", 0)) > 0:
             speeds[joint.get("name")] = float(limit.get("velocity"))

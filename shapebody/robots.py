@@ -239,7 +239,7 @@ def check_joints(model: mujoco.MjModel) -> Iterator[str]:
         ):
             yield (
                 f'joint {name} has no limits: expected range="lower upper" with lower < upper; '
-                "add the range of the real joint"
+                "add the range of the real joint (in a URDF, type revolute with <limit>)"
             )
 
 

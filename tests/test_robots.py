@@ -358,6 +358,12 @@ def test_files_that_are_no_robot_files(tmp_path):
         load_robot(tmp_path / "binary.xml")
 
 
+def test_xacro_templates_are_named(tmp_path):
+    (tmp_path / "robot.urdf").write_text('<robot name="a"><xacro:include filename="b"/></robot>')
+    with pytest.raises(ValueError, match="robot.urdf is a xacro template: .*expand it first"):
+        load_robot(tmp_path / "robot.urdf")
+
+
 def test_duplicate_names(tmp_path):
     path = own_robot(tmp_path, ('<body name="right"', '<body name="left"'))
     with pytest.raises(ValueError, match="repeated name 'left' in body.*used once per kind"):
