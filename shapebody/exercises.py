@@ -364,3 +364,46 @@ def check_radius(function, dim: int = 358) -> None:
         print(f"Not yet. For g = {g:g} and λ = {trust_region:g}: {hint}")
         return
     _say(True, f"With d = {dim}, larger λ means a proportionally smaller distance.", "")
+
+
+# ------------------------------------------------------------------ 05 fifty robots
+
+
+def check_growth(answer) -> None:
+    """Exercise: parameters that a fixed body, a body on a hinge without a motor, and a driven
+    segment with a foot add to a design vector; three numbers."""
+    if _waiting(answer, "three numbers (a, b, c)."):
+        return
+    try:
+        given = tuple(int(x) for x in answer)
+    except (TypeError, ValueError):
+        given = ()
+    if len(given) != 3:
+        print(f"Not yet. The answer is {answer!r}; it should be three whole numbers (a, b, c).")
+        return
+    hints = (
+        "(a) A body by itself has 13 parameters, with or without a hinge.",
+        "(b) A hinge adds 11 to its body's 13, with or without a motor.",
+        "(c) Body and hinge, then 3 for the motor and 3 for the foot.",
+    )
+    wrong = [hint for x, y, hint in zip(given, (13, 24, 30), hints, strict=True) if x != y]
+    _say(not wrong, "13 per body, 11 per hinge, 3 per motor, 3 per foot.", " ".join(wrong[:1]))
+
+
+def check_per_motor(answer) -> None:
+    """Exercise: the name of the shipped robot with the most design parameters per motor."""
+    if _waiting(answer, 'the name of a robot, such as "unitree_go2".'):
+        return
+    from shapebody.catalog import robot_table
+
+    ratios = {row["name"]: row["design_dim"] / row["actuators"] for row in robot_table()}
+    if answer not in ratios:
+        print(f"Not yet. There is no robot {answer!r}; use a name of sb.robots().")
+        return
+    best = max(ratios, key=ratios.get)
+    _say(
+        answer == best,
+        f"{ratios[best]:.1f} parameters per motor; the median is "
+        f"{np.median(list(ratios.values())):.1f}.",
+        f"{answer} has {ratios[answer]:.1f} per motor, another robot has more.",
+    )

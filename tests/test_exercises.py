@@ -193,3 +193,32 @@ def test_untried_exercises_are_no_errors(capsys):
         for answer in (None, lambda *_: None):
             check(answer)
             assert said(capsys).startswith("Not answered yet")
+
+
+# 05 fifty robots
+
+
+def test_growth(capsys):
+    check_growth = exercises.check_growth
+    for answer, expected in [
+        (None, "Not answered yet"),
+        (3, "three whole numbers"),
+        ((13, 24), "three whole numbers"),
+        ((14, 24, 30), "(a)"),
+        ((13, 11, 30), "(b)"),
+        ((13, 24, 27), "(c)"),
+        ((13, 24, 30), "Right"),
+    ]:
+        check_growth(answer)
+        assert expected in capsys.readouterr().out
+
+
+def test_per_motor(capsys):
+    for answer, expected in [
+        (None, "Not answered yet"),
+        ("no_such_robot", "no robot"),
+        ("unitree_go2", "another robot has more"),
+        ("nao_v5", "Right"),
+    ]:
+        exercises.check_per_motor(answer)
+        assert expected in capsys.readouterr().out
