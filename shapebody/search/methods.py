@@ -22,8 +22,15 @@ import numpy as np
 from shapebody.checkpoints import Agent
 from shapebody.locomotion.observations import Observation
 from shapebody.robots import Robot
+from shapebody.search.bayesian import BOConfig, bo
+from shapebody.search.directions import ARSConfig, ars
+from shapebody.search.evolution import CMAESConfig, cma_es
+from shapebody.search.loop import Search
 from shapebody.search.objective import Objective
-from shapebody.search.vgds import Search, VGDSConfig, penalty_only, vgds
+from shapebody.search.particles import GCPFOConfig, gc_pfo
+from shapebody.search.populations import CEMConfig, DEConfig, PSOConfig, cem, de, pso
+from shapebody.search.sampling import RandomConfig, TuRBOConfig, random, turbo
+from shapebody.search.vgds import VGDSConfig, penalty_only, vgds
 
 
 class Method(NamedTuple):
@@ -36,6 +43,15 @@ class Method(NamedTuple):
 METHODS: dict[str, Method] = {
     "vgds": Method(vgds, VGDSConfig),
     "penalty-only": Method(penalty_only, VGDSConfig),
+    "random": Method(random, RandomConfig),
+    "bo": Method(bo, BOConfig),
+    "cma-es": Method(cma_es, CMAESConfig),
+    "turbo": Method(turbo, TuRBOConfig),
+    "pso": Method(pso, PSOConfig),
+    "cem": Method(cem, CEMConfig),
+    "de": Method(de, DEConfig),
+    "ars": Method(ars, ARSConfig),
+    "gc-pfo": Method(gc_pfo, GCPFOConfig),
 }
 
 

@@ -4,20 +4,18 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import partial
-from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import optax
 
-
-class Search(NamedTuple):
-    """What a method returns for S starts."""
-
-    designs: jax.Array  # [S, d] found designs
-    trajectory: jax.Array  # [N + 1, S, d] current (or best) design after every iteration
-    history: jax.Array  # [N + 1, S] objective of the trajectory on minibatches
-    evaluations: int  # designs scored on a minibatch, per start
+from shapebody.search.loop import (
+    Search,
+    last_finite,
+    require_integers,
+    require_positive,
+    values_and_gradients,
+)
 
 
 @dataclass(frozen=True)
@@ -32,11 +30,8 @@ class VGDSConfig:
     """δ_max, the largest change of one design parameter in one iteration."""
 
     def __post_init__(self):
-        if self.iterations != int(self.iterations) or self.iterations < 1:
-            raise ValueError(f"iterations is {self.iterations!r}; expected an integer from 1 up")
-        for name in ("learning_rate", "max_update"):
-            if not 0 < getattr(self, name) < float("inf"):
-                raise ValueError(f"{name} is {getattr(self, name)!r}; expected a positive number")
+        require_integers(self, "iterations")
+        require_positive(self, "learning_rate", "max_update")
 
 
 def vgds(objective, starts, key, config: VGDSConfig) -> Search:
@@ -71,20 +66,11 @@ def _run(objective, starts, key, config: VGDSConfig, value_gradient: bool):
         if not value_gradient:
             gradient = jax.grad(lambda f: -jnp.sum(objective.penalty(f)))(designs)
             return objective(designs, states), gradient
-
-        def total(designs):
-            scores = objective(designs, states)
-            return jnp.sum(scores), scores
-
-        # Starts are independent, so the gradient of the sum holds the gradient of each.
-        (_, scores), gradient = jax.value_and_grad(total, has_aux=True)(designs)
-        return scores, gradient
+        return values_and_gradients(objective, designs, states)
 
     def iteration(carry, key):
         designs, adam_state = carry
         scores, gradient = score_and_gradient(designs, objective.batch(key))
-        # One broken gradient would stay in Adam's moments for good.
-        gradient = jnp.where(jnp.isfinite(gradient), gradient, 0.0)
         update, adam_state = adam.update(-gradient, adam_state)
         moved = jnp.clip(designs + jnp.clip(update, -limit, limit), -1.0, 1.0)
         return (moved, adam_state), (designs, scores)
@@ -92,4 +78,4 @@ def _run(objective, starts, key, config: VGDSConfig, value_gradient: bool):
     # One gradient more than steps: its score is that of the last design, its step is not taken.
     keys = jax.random.split(key, config.iterations + 1)
     _, (trajectory, history) = jax.lax.scan(iteration, (starts, adam.init(starts)), keys)
-    return trajectory[-1], trajectory, history
+    return last_finite(trajectory, history), trajectory, history
