@@ -243,7 +243,12 @@ def main():
             print(f"{label:52s} {ratio:12.2f}")
     from shapebody.experiments import provenance
 
-    record = {"rows": rows, "provenance": provenance(robot=ROBOT, environments=ENVIRONMENTS)}
+    source = provenance(robot=ROBOT, environments=ENVIRONMENTS)
+    rows = {label: {**row, "commit": source["commit"]} for label, row in rows.items()}
+    if os.path.exists(options.out):  # benchmarks that did not run this time keep their rows
+        with open(options.out) as file:
+            rows = {**json.load(file)["rows"], **rows}
+    record = {"rows": rows, "provenance": source}
     temporary = options.out + ".tmp"
     with open(temporary, "w") as file:
         json.dump(record, file, indent=1)

@@ -456,6 +456,7 @@ class Trainer:
         self.phases = []
         self.state = None
         self.saved_physics = None
+        self.in_step = True  # whether the engine is where `state` is
 
     def _constants(self, key):
         """Input standardization over the designs of all robots."""
@@ -509,10 +510,7 @@ class Trainer:
         self.learner, self.behaviour = saved["learner"], saved["behaviour"]
         self.state, self.seconds = saved["state"], float(saved["seconds"])
         self.saved_physics = saved["physics"]
-        if native:
-            self.env.restore(self.state, self.saved_physics)
-        else:
-            self.env.physics_state = self.saved_physics
+        self.in_step = False
         self.phases = _continued(self.folder / "training.json", self.config, self.steps)
         return True
 
@@ -572,6 +570,12 @@ class Trainer:
         if number >= last:
             return
         self.folder.mkdir(parents=True, exist_ok=True)
+        if not self.in_step:
+            if self.env.engine == "native":
+                self.env.restore(self.state, self.saved_physics)
+            else:
+                self.env.physics_state = self.saved_physics
+        self.in_step = False
         curve = _Curve(self.folder / "training.csv", self.steps)
         report = _Report(config, progress)
         # On an accelerator there is nothing to overlap: the device does one thing at a time.
@@ -620,8 +624,8 @@ class Trainer:
         env = self.env
         if not env.config.fixed_coefficient:
             # In the training environment, c would fall on bodies that the policy cannot move.
-            task = replace(env.config, fixed_coefficient=True)
-            env = Locomotion(env.robots, env.num_envs, engine=env.engine, config=task)
+            env = env.at_fixed_coefficient()
+        self.in_step = False
         state = env.reset(jax.random.fold_in(self.key, 1), coefficient=1.0, spread=True)
         length = self.config.rollout_length
         parts, robots, per = [], [], -(-count // rollouts)

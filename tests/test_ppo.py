@@ -78,6 +78,16 @@ def test_resume_is_exact(config, straight, tmp_path):
         np.testing.assert_array_equal(a, b)
 
 
+def test_a_run_goes_on_in_the_same_process(config, straight, tmp_path):
+    trainer = ppo.Trainer(config, tmp_path)
+    trainer.start()
+    trainer.run(max_steps=128, progress=False)
+    trainer.state_bank(rollouts=1)  # uses the same engine
+    trainer.run(max_steps=128 * 4, progress=False)
+    for a, b in zip(leaves(straight[1]), leaves(trainer), strict=True):
+        np.testing.assert_array_equal(a, b)
+
+
 def test_a_crash_while_saving_loses_nothing(config, straight, tmp_path, monkeypatch):
     trainer = ppo.Trainer(config, tmp_path)
     trainer.start()

@@ -5,6 +5,7 @@ C MuJoCo; with MJX the whole rollout is one jitted scan. Environments of several
 share one batch: joints, feet and spheres are padded to the largest robot and masked.
 """
 
+import copy
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
@@ -268,19 +269,36 @@ class Locomotion:
         return state
 
     def descriptions(self, robot: int, designs) -> Descriptions:
-        """Descriptions [S, ...] of designs [S, d] of robot number `robot`, in this batch's sizes.
+        """Descriptions [S, ...] of designs [S, d] of robot number `robot`, padded to this batch."""
+        return self._bodies(self.groups[robot], designs)[0]
 
-        Uses the function that starts episodes, so nothing is compiled for it.
+    def _bodies(self, group, designs):
+        """Descriptions and embodiments of designs [S, d], as NumPy arrays.
+
+        They come from the function that starts episodes, in chunks of its size, so that nothing
+        is compiled for them and every bit is that of an episode.
         """
         designs = np.asarray(designs, np.float32)
         keys = np.asarray(jax.random.split(jax.random.PRNGKey(0), RESET_SLOTS))
+        zeros = np.zeros(RESET_SLOTS, np.float32), np.zeros(RESET_SLOTS, np.int32)
         parts = []
         for at in range(0, len(designs), RESET_SLOTS):
             rows = np.minimum(np.arange(at, at + RESET_SLOTS), len(designs) - 1)
-            zeros = np.zeros(RESET_SLOTS, np.float32), np.zeros(RESET_SLOTS, np.int32)
-            state, *_ = self.groups[robot].jitted_start(keys, designs[rows], *zeros)
-            parts.append(jax.tree.map(np.asarray, state.descriptions))
+            state, embodiment, *_ = group.jitted_start(keys, designs[rows], *zeros)
+            parts.append(jax.tree.map(np.asarray, (state.descriptions, embodiment)))
         return jax.tree.map(lambda *x: np.concatenate(x)[: len(designs)], *parts)
+
+    def at_fixed_coefficient(self) -> "Locomotion":
+        """The same environments with a curriculum coefficient that stays as it is at the reset.
+
+        They share physics and compiled functions: `reset` or `restore` one before using it after
+        the other.
+        """
+        other = copy.copy(self)
+        other.config = replace(self.config, fixed_coefficient=True)
+        other._advance_jit = jax.jit(other._advance)
+        other._steps = {}
+        return other
 
     def _begin(self, group, ids, keys, designs, coefficients, streaks) -> list[Episode]:
         """Native engine: start episodes in environments `ids` of a group, RESET_SLOTS at a
@@ -467,8 +485,8 @@ class Locomotion:
         """Continue from a saved `state` and its `physics_arrays` (native engine)."""
         designs = np.asarray(state.design)
         for group, saved in zip(self.groups, arrays, strict=True):
-            f = designs[group.slice, : group.space.dim]
-            group.physics.set_designs(np.arange(group.count), jax.vmap(group.space)(f))
+            _, embodiments = self._bodies(group, designs[group.slice, : group.space.dim])
+            group.physics.set_designs(np.arange(group.count), embodiments)
             group.physics.restore(saved)
 
 
