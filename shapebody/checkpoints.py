@@ -118,6 +118,12 @@ class Agent:
         return _hash(_flat_weights(self))
 
     @property
+    def states_hash(self) -> str | None:
+        """SHA-256 of the state bank; None without one."""
+        states = _flat_states(self)
+        return None if states is None else _hash(states)
+
+    @property
     def num_states(self) -> int:
         """Size M of the state bank."""
         return 0 if self.states is None else len(self.states.general)

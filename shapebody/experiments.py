@@ -72,6 +72,7 @@ def provenance(agent=None, seconds: float | None = None, **config) -> dict:
         record["agent"] = {
             "name": agent.name,
             "hash": agent.hash,
+            "states_hash": agent.states_hash,
             "steps": agent.metadata.get("steps"),
         }
     if seconds is not None:
@@ -103,7 +104,10 @@ def result(name: str, compute: Callable[[], list[dict]], agent=None, recompute=F
             stored = json.loads(path.read_text())
             source, _ = stored["provenance"], stored["records"]
             same = source["config"] == config
-            same &= agent is None or source["agent"]["hash"] == agent.hash
+            if agent is not None:
+                known = source["agent"]
+                same &= known["hash"] == agent.hash
+                same &= known.get("states_hash", agent.states_hash) == agent.states_hash
         except (json.JSONDecodeError, KeyError, TypeError) as error:
             raise ValueError(
                 f"{path.name} in data/results is damaged ({error}); delete it, or call with "
@@ -126,39 +130,66 @@ def result(name: str, compute: Callable[[], list[dict]], agent=None, recompute=F
 # ------------------------------------------------------------------ single-robot design (4.1)
 
 
-def single_robot_design(
+def single_robot_design(agent, robot, trust_regions=(20.0, 100.0), **settings) -> list[dict]:
+    """VGDS and the penalty alone from the paper's start designs, and VGDS from the reference.
+
+    Args:
+        agent, robot: who is asked, and about which robot.
+        trust_regions: λ of VGDS.
+        settings: see `design_study`, whose records are returned.
+    """
+    runs = [("start", "penalty-only", None)]
+    for trust_region in trust_regions:
+        runs += [("start", "vgds", trust_region), ("reference", "vgds", trust_region)]
+    return design_study(agent, robot, runs, **settings)
+
+
+def design_study(
     agent,
     robot,
+    runs,
     starts: int = 10,
     episodes: int = 200,
-    trust_regions=(20.0, 100.0),
     horizon: int = 1000,
     seed: int = 0,
     progress: bool = False,
 ) -> list[dict]:
-    """VGDS and the penalty alone, from the paper's start designs and from the reference.
+    """Search for designs in several ways and let the frozen policy walk with all of them.
 
     Every found design, every start and the reference are evaluated on the same episodes of
     `horizon` control steps.
 
+    Args:
+        agent, robot: who is asked, and about which robot.
+        runs: searches (origin, method, λ). origin "start": from the paper's start designs, all in
+            one batch; "reference": from f = 0. The penalty alone has no λ (None), because Adam
+            removes the scale of its gradient.
+        starts: number of start designs.
+        episodes: evaluation episodes per design.
+        seed: of the searches and of the evaluation.
+        progress: show the evaluation's progress.
+
     Returns:
-        One record per design: origin ("start" or "reference"), start number, method ("none",
-        "vgds", "penalty-only"), trust_region, the search's seconds per design (all starts at once,
-        without compilation), mean return, its
-        deviation over episodes, the gain over the design where the search began with its 95 %
-        interval over paired episodes, tracking error, length, number of episodes that became
-        non-finite, and predicted value (mean critic value without penalty).
+        One record per design: origin, start number, method ("none" for the designs where searches
+        begin), trust_region, the search's seconds per design (without compilation), critic
+        evaluations per design, mean return, its deviation over episodes, the gain over the design
+        where the search began with its 95 % interval over paired episodes, tracking error (m/s),
+        length (control steps), number of episodes that became non-finite, predicted value (mean
+        critic value over the state bank, without penalty) and distance |f - f_ref| / sqrt(d).
     """
     from shapebody.design import DesignSpace
     from shapebody.evaluation import evaluate, paired_gain
     from shapebody.search import Objective, search
 
     space = DesignSpace(robot)
-    initial = np.stack([space.start(i) for i in range(starts)])
+    initial = {
+        "start": np.stack([space.start(i) for i in range(starts)]),
+        "reference": space.reference[None],
+    }
     designs, records = [], []
 
-    def add(found, origin, method, trust_region=None, seconds=0.0):
-        for i, f in enumerate(np.atleast_2d(found)):
+    def add(origin, method, trust_region, found, seconds=0.0, evaluations=0):
+        for i, f in enumerate(found):
             designs.append(f)
             records.append(
                 {
@@ -166,22 +197,18 @@ def single_robot_design(
                     "start": i if origin == "start" else None,
                     "method": method,
                     "trust_region": trust_region,
-                    "search_seconds": seconds / len(np.atleast_2d(found)),
+                    "search_seconds": seconds / len(found),
+                    "evaluations": evaluations,
                 }
             )
 
-    def find(origin, f, method, trust_region):
-        for _ in range(2 if trust_region == trust_regions[0] else 1):
-            # The first search of its kind is compiled; only the last one is timed.
-            found = search(method, agent, robot, f, trust_region=trust_region, seed=seed)
-        add(found.design, origin, method, trust_region, found.seconds)
-
-    add(initial, "start", "none")
-    add(space.reference, "reference", "none")
-    for trust_region in trust_regions:
-        find("start", initial, "vgds", trust_region)
-        find("start", initial, "penalty-only", trust_region)
-        find("reference", space.reference, "vgds", trust_region)
+    for origin, f in initial.items():
+        add(origin, "none", None, f)
+    for origin, method, trust_region in runs:
+        given = 100.0 if trust_region is None else trust_region
+        found = search(method, agent, robot, initial[origin], trust_region=given, seed=seed)
+        seconds = found.seconds - found.compile_seconds
+        add(origin, method, trust_region, found.design, seconds, found.evaluations)
     designs = np.stack(designs)
     predicted = Objective.of(agent, robot, 0.0).value(designs)
     config = _evaluation(episodes, horizon)
@@ -199,6 +226,7 @@ def single_robot_design(
             "tracking_error": float(score.tracking_error[i].mean()),
             "length": float(score.lengths[i].mean()),
             "predicted_value": float(predicted[i]),
+            "distance": float(np.sqrt(np.mean(designs[i] ** 2))),
             "episodes": episodes,
             "engine": score.settings["engine"],
         }
@@ -213,7 +241,7 @@ def _evaluation(episodes: int, horizon: int):
 
 
 def gains(records: list[dict]) -> list[dict]:
-    """Gains in return ΔR with 95 % intervals, from the records of `single_robot_design`.
+    """Gains in return ΔR with 95 % intervals, from the records of `design_study`.
 
     Returns:
         One record per comparison: method, over ("start", "penalty-only" or "reference"),
@@ -237,7 +265,7 @@ def gains(records: list[dict]) -> list[dict]:
     if len(base) != 1 or not initial:
         raise ValueError(
             f"the records hold {len(base)} evaluations of the reference and {len(initial)} of "
-            "starts; expected one and at least one, as single_robot_design returns them"
+            "starts; expected one and at least one, as design_study returns them"
         )
     rows = []
 
@@ -261,8 +289,9 @@ def gains(records: list[dict]) -> list[dict]:
             continue
         compare(method, "start", trust_region, after, initial)
         if method != "penalty-only":
-            control = found.get(("penalty-only", trust_region), {})
-            compare(method, "penalty-only", trust_region, after, control)
+            control = found.get(("penalty-only", None))
+            if control is not None:
+                compare(method, "penalty-only", trust_region, after, control)
     for r in reference:
         if r["method"] != "none":
             interval = r["gain"], r["gain_low"], r["gain_high"]

@@ -6,7 +6,7 @@ import pytest
 
 from shapebody import experiments
 
-AGENT = SimpleNamespace(name="a", hash="1234", metadata={"steps": 7})
+AGENT = SimpleNamespace(name="a", hash="1234", states_hash="56", metadata={"steps": 7})
 
 
 @pytest.fixture
@@ -53,19 +53,23 @@ def test_result_is_computed_once_and_loaded_afterwards(results):
     second = experiments.result("x", compute, AGENT, starts=2)
     assert compute.calls == 1
     assert first == second == json.loads((results / "x.json").read_text())
-    assert first["provenance"]["agent"] == {"name": "a", "hash": "1234", "steps": 7}
+    source = {"name": "a", "hash": "1234", "states_hash": "56", "steps": 7}
+    assert first["provenance"]["agent"] == source
 
 
 def test_result_of_another_agent_or_setting_is_computed_anew(results):
     compute = Computation()
     experiments.result("x", compute, AGENT, starts=2)
     experiments.result("x", compute, AGENT, starts=3)
-    other = SimpleNamespace(name="a", hash="5678", metadata={})
+    other = SimpleNamespace(name="a", hash="5678", states_hash="56", metadata={})
     stored = experiments.result("x", compute, other, starts=3)
     assert compute.calls == 3
     assert stored["provenance"]["agent"]["hash"] == "5678"
-    experiments.result("x", compute, other, recompute=True, starts=3)
+    other.states_hash = "57"
+    experiments.result("x", compute, other, starts=3)
     assert compute.calls == 4
+    experiments.result("x", compute, other, recompute=True, starts=3)
+    assert compute.calls == 5
 
 
 def test_full_scale_has_its_own_file(results, monkeypatch):
@@ -121,7 +125,7 @@ def synthetic(vgds=(7.0, 9.0, 8.0), penalty=(6.0, 7.5, 7.0)):
     records = [record("start", i, "none", None, x) for i, x in enumerate(initial)]
     records += [record("start", i, "vgds", 20.0, x) for i, x in enumerate(vgds)]
     # The order of records must not matter.
-    records += [record("start", i, "penalty-only", 20.0, x) for i, x in enumerate(penalty)][::-1]
+    records += [record("start", i, "penalty-only", None, x) for i, x in enumerate(penalty)][::-1]
     records.append(record("reference", None, "none", None, 5.0, gain=0.0))
     interval = dict(gain=0.5, gain_low=0.2, gain_high=0.8)
     return records + [record("reference", None, "vgds", 20.0, 5.5, **interval)]
@@ -134,7 +138,7 @@ def test_gains_are_paired_by_start():
     assert 1 <= one["low"] <= one["mean"] <= one["high"] <= 1.5
     assert (one["pairs"], one["positive"]) == (3, 3)
     assert experiments.gain(rows, "vgds", "start", 20.0)["mean"] == pytest.approx(6)
-    assert experiments.gain(rows, "penalty-only", "start", 20.0)["mean"] == pytest.approx(29 / 6)
+    assert experiments.gain(rows, "penalty-only", "start")["mean"] == pytest.approx(29 / 6)
     reference = experiments.gain(rows, "reference", "start")
     assert (reference["mean"], reference["positive"]) == (pytest.approx(3), 3)
     own = experiments.gain(rows, "vgds", "reference", 20.0)
