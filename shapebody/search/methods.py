@@ -2,8 +2,11 @@
 
 A method is a function `method(objective, starts [S, d], key, config) -> Search`. It may ask the
 objective for minibatches of states (`objective.batch(key)`), values (`objective(designs, states)`)
-and their gradients, keeps designs inside [-1, 1] and returns one design per start. To add one,
-write the function and a frozen dataclass of its settings, and enter both in `METHODS`.
+and their gradients, keeps designs inside [-1, 1] and returns one design per start, which does not
+depend on the other starts. What it returns is its own last recommendation: the last iterate of an
+ascent (VGDS, ARS), the mean of a distribution (CEM, CMA-ES), the best design of a population or of
+all draws. To add a method, write the function and a frozen dataclass of its settings, and enter
+both in `METHODS`; `loop.iterate` runs one that proposes designs and learns from their scores.
 """
 
 from __future__ import annotations
@@ -64,7 +67,8 @@ class SearchResult:
         trajectory: designs from the start (row 0) to the end, [N + 1, d] or [N + 1, S, d].
         objective: Ĵ_λ of `design` on the whole state bank, a float or [S].
         history: Ĵ_λ along the trajectory, each on the minibatch of its iteration, [N + 1(, S)].
-        evaluations: number of designs scored per start, each on one minibatch.
+        evaluations: number of designs that the method scored per start, each on one minibatch;
+            scores that only fill `history` are not counted.
         seconds: wall time of the search for all starts, compilation included.
         compile_seconds: the part of it that went into compilation; 0 when a search of the same
             kind (method, settings, robot, number of starts, size of the critic) ran before.
@@ -96,10 +100,13 @@ def search(
     states: Observation | None = None,
     **settings,
 ) -> SearchResult:
-    """Search for a better design with a frozen agent (Section 3.2).
+    """Search for a better design with a frozen agent (Section 3.2; baselines: Appendix C).
 
     Args:
-        method: a name in `METHODS`, such as "vgds".
+        method: a name in `METHODS`: "vgds"; its control without the critic, "penalty-only"; or a
+            baseline that maximizes the same objective: "random", "bo", "cma-es", "turbo", "pso",
+            "cem", "de", "ars", "gc-pfo". The defaults of every method are the paper's settings.
+            "bo" needs PyTorch (the extra `bo`).
         agent: the frozen agent; its critic judges designs on the states of its state bank.
         robot: the robot to be designed.
         f: start design(s) [d] or [S, d] in [-1, 1]; several are searched at once, each on its own.
@@ -113,6 +120,7 @@ def search(
     Raises:
         ValueError: for an unknown method or setting, a wrong design or reference, a negative λ, an
             agent that does not fit the robot.
+        ImportError: for "bo" without PyTorch and BoTorch.
     """
     function, config = _method(method, settings)
     objective = Objective.of(agent, robot, trust_region, reference, states, batch_size)
