@@ -407,3 +407,78 @@ def check_per_motor(answer) -> None:
         f"{np.median(list(ratios.values())):.1f}.",
         f"{answer} has {ratios[answer]:.1f} per motor, another robot has more.",
     )
+
+
+# ------------------------------------------------------------------ 06 bring your own robot
+
+
+def check_knee_torque(answer, robot) -> None:
+    """Exercise: torque in N m at the last hinge of a leg, with the weight shared by all feet."""
+    if _waiting(answer, "one number in N m."):
+        return
+    answer = _number(answer)
+    if answer is None:
+        return
+    import mujoco
+
+    model, data = robot.model, mujoco.MjData(robot.model)
+    data.qpos[:] = robot.home
+    mujoco.mj_kinematics(model, data)
+    joint = model.body_jntadr[robot.foot_bodies[0]]
+    reach = data.geom_xpos[robot.feet[0]] - data.xanchor[joint]
+    weight = -model.body_mass[1:].sum() * model.opt.gravity
+    turn = np.cross(reach, weight) @ data.xaxis[joint]
+    expected = abs(turn) / robot.num_feet
+
+    def near(value):
+        return abs(abs(answer) - value) <= 0.05 * value
+
+    hints = (
+        (expected * robot.num_feet, "That is one knee with the whole weight; all feet carry it."),
+        (expected / 9.81, "A mass is not a force: multiply by 9.81 m/s²."),
+        (
+            np.linalg.norm(weight) / robot.num_feet * abs(reach[2]),
+            "The force is vertical, so its lever is the horizontal distance from knee to foot.",
+        ),
+        (
+            np.linalg.norm(weight) / robot.num_feet * np.linalg.norm(reach),
+            "The lever is not the length of the shin, only its horizontal part.",
+        ),
+    )
+    hint = next(
+        (text for value, text in hints if near(value)),
+        "Weight on one foot times the horizontal distance from knee to foot.",
+    )
+    limit = model.actuator_forcerange[:, 1].min()
+    _say(
+        near(expected),
+        f"It is {expected:.2f} N m; the weakest motor has {limit:g} N m.",
+        hint,
+    )
+
+
+def check_twelve_motors(path, motors: int = 12) -> None:
+    """Exercise: a robot file with `motors` motors that validates with nothing left to say."""
+    if _waiting(path, "write the file and hand over its path."):
+        return
+    from shapebody.validation import validate_robot
+
+    try:
+        report = validate_robot(path)
+    except TypeError:
+        print(f"Not yet. Hand over the path of the file, not {type(path).__name__}.")
+        return
+    if not report.ok:
+        print(f"Not yet. {report.problems[0]}")
+        return
+    robot = report.robot
+    left = (*report.inferred, *report.warnings)
+    if robot.num_actuators != motors:
+        print(f"Not yet. The robot has {robot.num_actuators} motors instead of {motors}.")
+        return
+    _say(
+        not left,
+        f"d = {robot.design_dim}: a hinge adds 11 parameters and its motor 3, a further body would "
+        "add 13.",
+        f"The report still says: {left[0]}" if left else "",
+    )

@@ -75,7 +75,7 @@ _FIXES = {
     "repeated name": "each name may be used once per kind of element; rename one of the two",
     "moving bodies": "give every body that moves an <inertial> with mass and inertia > 0",
     "qpos size": "give each keyframe as many numbers as the robot has positions (7 for the free "
-    "joint, then 1 per hinge)",
+    "joint, then 1 per hinge); if it has them, the trunk lacks its <freejoint/>",
     "balanceinertia": 'correct the inertia, or let <compiler balanceinertia="true"/> repair it',
     "XML": "expected a complete XML file; it may be cut off, so look at the place that is named",
 }

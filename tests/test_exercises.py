@@ -222,3 +222,107 @@ def test_per_motor(capsys):
     ]:
         exercises.check_per_motor(answer)
         assert expected in capsys.readouterr().out
+
+
+# 06 bring your own robot
+
+LEGGED = """
+<mujoco>
+  <compiler angle="radian" autolimits="true"/>
+  <option timestep="0.005"/>
+  <default>
+    <geom contype="0" conaffinity="0"/>
+    <position kp="20" kv="0.5" forcerange="-9 9"/>
+    <joint damping="0.1" armature="0.01"/>
+  </default>
+  <worldbody>
+    <geom name="floor" type="plane" size="0 0 0.05"/>
+    <body name="trunk" pos="0 0 0.2">
+      <freejoint/>
+      <site name="imu"/>
+      <geom type="box" size="0.1 0.1 0.03" mass="3.2"/>
+      <geom type="sphere" size="0.05" mass="0" group="5"/>{legs}
+    </body>
+  </worldbody>
+  <actuator>{motors}</actuator>
+  <keyframe><key name="home" qpos="0 0 0.17 1 0 0 0{zeros}"/></keyframe>
+  <custom>
+    <numeric name="action_scale" data="0.3"/>
+    <numeric name="velocity_limits" data="{speeds}"/>
+  </custom>
+</mujoco>
+"""
+LEG = """
+      <body name="{leg}_thigh" pos="{x} {y} 0">{hinges}
+        <geom type="capsule" fromto="0 0 0 {x} 0 0" size="0.02" mass="0.1"/>
+        <body name="{leg}_shin" pos="{x} 0 0">
+          <joint name="{leg}_knee" axis="0 1 0" range="-1 1"/>
+          <geom name="{leg}_foot" type="sphere" size="0.02" mass="0.1" pos="{out} 0 -0.15"/>
+        </body>
+      </body>"""
+
+
+def legged(folder, joints, changes=()):
+    """File of a four-legged robot of 4 kg whose feet are 0.05 m outside its knees."""
+    legs = motors = ""
+    for leg, x, y in (("FL", 1, 1), ("FR", 1, -1), ("RL", -1, 1), ("RR", -1, -1)):
+        hinges = "".join(
+            f'\n        <joint name="{leg}_{joint}" axis="{axis}" range="-0.7 0.7"/>'
+            for joint, axis in (("swing", "0 0 1"), ("lift", "0 1 0"))
+            if joint in joints
+        )
+        legs += LEG.format(leg=leg, hinges=hinges, x=0.1 * x, y=0.1 * y, out=0.05 * x)
+        motors += "".join(f'<position name="{leg}_{j}" joint="{leg}_{j}"/>' for j in joints)
+    number = 4 * len(joints)
+    text = LEGGED.format(legs=legs, motors=motors, zeros=" 0" * number, speeds=" 15" * number)
+    for old, new in changes:
+        assert old in text
+        text = text.replace(old, new)
+    path = folder / "legged.xml"
+    path.write_text(text)
+    return path
+
+
+def test_knee_torque(tmp_path, capsys):
+    robot = load_robot(legged(tmp_path, ("swing", "knee")))
+    exercises.check_knee_torque(None, robot)
+    assert said(capsys).startswith("Not answered yet")
+    for answer in (4 * 9.81 / 4 * 0.05, -0.49):
+        exercises.check_knee_torque(answer, robot)
+        assert said(capsys) == "Right. It is 0.49 N m; the weakest motor has 9 N m."
+    for answer, hint in (
+        (4 * 9.81 * 0.05, "all feet"),
+        (0.05, "not a force"),
+        (9.81 * 0.15, "vertical"),
+        (9.81 * np.hypot(0.05, 0.15), "length of the shin"),
+        (7, "Weight on one foot"),
+        ("much", "should be one number"),
+    ):
+        exercises.check_knee_torque(answer, robot)
+        text = said(capsys)
+        assert text.startswith("Not yet") and hint in text, answer
+
+
+def test_twelve_motors(tmp_path, capsys):
+    exercises.check_twelve_motors(None)
+    assert said(capsys).startswith("Not answered yet")
+    joints = ("swing", "lift", "knee")
+    exercises.check_twelve_motors(legged(tmp_path, joints))
+    assert said(capsys).startswith("Right. d = 306")
+    sphere = '<geom type="sphere" size="0.05" mass="0" group="5"/>'
+    for path, hint in (
+        (legged(tmp_path, ("swing", "knee")), "8 motors"),
+        (3, "not int"),
+        (tmp_path / "none.xml", "does not exist"),
+    ):
+        exercises.check_twelve_motors(path)
+        text = said(capsys)
+        assert text.startswith("Not yet") and hint in text
+    for change, hint in (
+        ((' axis="0 1 0" range="-1 1"', ' axis="0 1 0"'), "has no limits"),
+        (('<site name="imu"/>', ""), 'no site "imu"'),
+        ((sphere, ""), "no collision spheres"),
+    ):
+        exercises.check_twelve_motors(legged(tmp_path, joints, [change]))
+        text = said(capsys)
+        assert text.startswith("Not yet") and hint in text

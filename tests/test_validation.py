@@ -64,6 +64,12 @@ def test_problems_are_the_errors_of_load_robot(tmp_path, case):
     assert not (tmp_path / "out.xml").exists()
 
 
+def test_a_complete_keyframe_without_a_free_joint(tmp_path):
+    # MuJoCo stops at the keyframe, whose numbers are right.
+    (problem,) = validate_robot(own_robot(tmp_path, ("<freejoint/>", ""))).problems
+    assert "expected 2, got 9" in problem and "the trunk lacks its <freejoint/>" in problem
+
+
 def test_files_that_cannot_be_read(tmp_path):
     (tmp_path / "cut.xml").write_text(OWN[:300])
     (tmp_path / "empty.xml").write_text("")
