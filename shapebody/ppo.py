@@ -126,8 +126,9 @@ class TrainConfig:
                 "policy": PolicyConfig.reduced(),
                 "critic": CriticConfig.reduced(),
                 "standardize": True,
-                "num_envs": 256,
-                "rollout_length": 32,
+                # Short rollouts of many environments: more bodies in a batch of the same size.
+                "num_envs": 1024,
+                "rollout_length": 8,
                 "minibatch_size": 2048,
                 "epochs": 3,
                 "total_steps": 50_000_000,
@@ -706,6 +707,7 @@ def train_critic(
     # Robots by the names or files they were trained from.
     robots = tuple(agent.metadata["config"]["robots"])
     base = TrainConfig.at_scale(agent.metadata["scale"], robots[0], name=agent.name)
+    length = max(base.rollout_length, 32)
     config = replace(
         base,
         **{
@@ -715,6 +717,9 @@ def train_critic(
             "standardize": True,
             "learn_policy": False,
             "gae_lambda": 0.95,
+            # Returns with that λ look further ahead than short rollouts reach.
+            "num_envs": base.batch // length,
+            "rollout_length": length,
             "total_steps": steps,
             **changes,
         },

@@ -301,8 +301,8 @@ def sources(sheets: list[dict], licences: dict) -> str:
         "textures. `d` is the dimension of the design vector.",
         "",
         "Gains, action scale, number of actuators and `d` are those of the paper. What the sources",
-        "do not give, or what was chosen, is listed as estimated. No file was copied. Licences are",
-        "those of the sources, where one was found in them, for those who go back to the originals.",
+        "do not give, or what was chosen, is listed as estimated. No file was copied. Licences",
+        "are those of the sources, as far as one was found, for those who go back to them.",
         "",
     ]
     for sheet in sheets:
