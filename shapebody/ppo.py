@@ -14,6 +14,7 @@ over the full design space.
 """
 
 import csv
+import hashlib
 import io
 import json
 import sys
@@ -505,14 +506,16 @@ class Trainer:
                     f"{self.folder.name} has an agent but no training.safetensors to continue "
                     "from; training anew would overwrite it: choose another name or folder"
                 )
-            self.phases = [{"from_step": 0, "config": _plain(self.config)}]
+            robots = {robot.name: _robot_hash(robot) for robot in self.env.robots}
+            self.phases = [{"from_step": 0, "config": _plain(self.config), "robots": robots}]
             return False
         saved = load_arrays(path, self._everything())
         self.learner, self.behaviour = saved["learner"], saved["behaviour"]
         self.state, self.seconds = saved["state"], float(saved["seconds"])
         self.saved_physics = saved["physics"]
         self.in_step = False
-        self.phases = _continued(self.folder / "training.json", self.config, self.steps)
+        path = self.folder / "training.json"
+        self.phases = _continued(path, self.config, self.steps, self.env.robots)
         return True
 
     def agent(self, states=None) -> Agent:
@@ -753,11 +756,16 @@ SCHEDULE = ("total_steps", "epochs", "minibatch_size", "learning_rate", "state_b
 """Fields that may change when a run is continued; each change is recorded."""
 
 
-def _continued(path: Path, config: TrainConfig, steps: int) -> list[dict]:
-    """The phases of a run that goes on with `config`: a list of {"from_step", "config"}.
+def _robot_hash(robot) -> str:
+    return hashlib.sha256(robot.xml.encode()).hexdigest()[:16]
+
+
+def _continued(path: Path, config: TrainConfig, steps: int, robots=()) -> list[dict]:
+    """The phases of a run that goes on with `config`: a list of {"from_step", "config"}, the first
+    with hashes of the robots' files.
 
     Raises:
-        ValueError: if more than the schedule differs from the run in `path`.
+        ValueError: if more than the schedule, or a robot's file, differs from the run in `path`.
     """
     try:
         phases = json.loads(path.read_text())
@@ -775,6 +783,13 @@ def _continued(path: Path, config: TrainConfig, steps: int) -> list[dict]:
         raise ValueError(
             f"the run in {path.parent.name} has another configuration ({text}); continue it with "
             "the old one, or choose another name"
+        )
+    known = phases[0].get("robots", {})
+    changed = [r.name for r in robots if known.get(r.name, _robot_hash(r)) != _robot_hash(r)]
+    if changed:
+        raise ValueError(
+            f"the file of robot {', '.join(changed)} has changed since the run in "
+            f"{path.parent.name} began; put the old file back, or train under another name"
         )
     return phases + [{"from_step": steps, "config": now}] if different else phases
 

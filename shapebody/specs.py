@@ -108,10 +108,23 @@ def drop_geom(spec, geom):
 
 
 def add_floor(spec) -> str:
-    """Add the floor; returns the note that says so."""
-    spec.worldbody.add_geom(
-        name="floor", type=_GEOM.mjGEOM_PLANE, size=[0, 0, 0.05], contype=0, conaffinity=0
-    )
+    """Add the floor; returns the note that says so.
+
+    A file without a floor mostly has no light and no sky either, and pictures of it would be
+    black: both are added where missing.
+    """
+    floor = spec.worldbody.add_geom(name="floor", type=_GEOM.mjGEOM_PLANE, size=[0, 0, 0.05])
+    floor.contype = floor.conaffinity = 0
+    floor.rgba = [0.8, 0.82, 0.84, 1]
+    sky = mujoco.mjtTexture.mjTEXTURE_SKYBOX
+    if not any(texture.type == sky for texture in spec.textures):
+        flat, colour = mujoco.mjtBuiltin.mjBUILTIN_FLAT, [0.86, 0.9, 0.95]
+        name = unused("sky", {texture.name for texture in spec.textures})
+        spec.add_texture(
+            name=name, type=sky, builtin=flat, rgb1=colour, rgb2=colour, width=8, height=48
+        )
+    if not spec.lights:
+        spec.visual.headlight.ambient = [0.45, 0.45, 0.45]
     return (
         "no floor: a plane at z = 0 is added; to say it yourself add "
         '<geom name="floor" type="plane" size="0 0 0.05" contype="0" conaffinity="0"/>'
