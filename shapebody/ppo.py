@@ -628,7 +628,7 @@ class Trainer:
         env = self.env
         if not env.config.fixed_coefficient:
             # In the training environment, c would fall on bodies that the policy cannot move.
-            env = env.at_fixed_coefficient()
+            env = env.with_task(replace(env.config, fixed_coefficient=True))
         self.in_step = False
         state = env.reset(jax.random.fold_in(self.key, 1), coefficient=1.0, spread=True)
         length = self.config.rollout_length
@@ -700,7 +700,8 @@ def train_critic(
         folder: where the new agent is saved; data/checkpoints/<agent> by default, which replaces
             the old critic there. The phase's own state and curve are in a folder in it.
         progress, max_seconds, engine: see `train`. A run that was stopped is continued.
-        changes: replace fields of the TrainConfig; by default gae_lambda is 0.95.
+        changes: replace fields of the TrainConfig; by default gae_lambda is 0.95, and rollouts
+            have at least 32 steps.
 
     Returns:
         The agent with the new critic and a new state bank. Its metadata are those of the policy's

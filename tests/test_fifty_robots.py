@@ -3,7 +3,6 @@
 import collections
 import importlib.util
 import json
-from dataclasses import replace
 
 import jax
 import mujoco
@@ -74,13 +73,15 @@ def test_stands_and_keeps_its_reference(name):
     size = model.geom_size[robot.feet]
     reach = np.where(robot.foot_types == 1, (vertical * size).sum(-1), size[:, 0])
     lowest = data.geom_xpos[robot.feet, 2] - reach
-    assert abs(lowest.min()) < 1e-6 and lowest.max() < 0.02, "a foot is off the floor"
+    assert abs(lowest.min()) < 1e-6 and lowest.max() < 0.015 * robot.home[2], "a foot is in the air"
     low, high = model.jnt_range[robot.joints[robot.actuated]].T
     assert np.all((low <= robot.nominal) & (robot.nominal <= high))
+    touching = set()
     for _ in range(40):  # 0.2 s: the soft gains let it sink, but not fall
         mujoco.mj_step(model, data)
+        touching |= {int(geom) for contact in data.contact for geom in contact.geom}
     assert np.isfinite(data.qpos).all() and data.qpos[2] > 0.75 * robot.home[2]
-    assert {geom for contact in data.contact for geom in contact.geom} > {robot.floor}
+    assert touching == {robot.floor, *robot.feet}
 
     # Φ(0) is the reference.
     body = DesignSpace(robot)(np.zeros(robot.design_dim, np.float32))
@@ -185,11 +186,9 @@ def wave(params, key, descriptions, observation):
 
 
 def test_company_changes_no_trajectory(trained):
-    everyone = trained[0].env
-    config = replace(TaskConfig(**QUIET), horizon=1000)
-    mixed = everyone
-    mixed_config, mixed.config = mixed.config, config
-    mixed._steps.clear()
+    """A robot of each morphology, and those with most joints and feet, alone and among all."""
+    config = TaskConfig(**QUIET)
+    mixed = trained[0].env.with_task(config)
     designs = np.zeros((mixed.num_envs, mixed.design_dim), np.float32)
     rng = np.random.default_rng(0)
     for group in mixed.groups:
@@ -197,28 +196,32 @@ def test_company_changes_no_trajectory(trained):
     keys = jax.random.split(jax.random.PRNGKey(3), mixed.num_envs)
     state = mixed.reset(None, designs=designs, keys=keys)
     _, together = mixed.rollout(wave, None, state, jax.random.PRNGKey(0), 6)
-    for name in SMALL.values():
+    for name in (*SMALL.values(), "fourier_gr1t2", "golem"):
         group = next(g for g in mixed.groups if g.robot.name == name)
-        own, joints = group.slice, group.robot.num_actuators
-        alone = Locomotion(group.robot, group.count, engine="native", config=config, threads=1)
-        state = alone.reset(None, designs=designs[own, : group.space.dim], keys=keys[own])
+        own, robot = group.slice, group.robot
+        alone = Locomotion(robot, group.count, engine="native", config=config, threads=1)
+        state = alone.reset(None, designs=designs[own, : robot.design_dim], keys=keys[own])
         _, single = alone.rollout(wave, None, state, jax.random.PRNGKey(0), 6)
+        close = dict(rtol=1e-3, atol=1e-4)
+        positions = alone.groups[0].physics.qpos
+        np.testing.assert_allclose(group.physics.qpos, positions, **close, err_msg=name)
         np.testing.assert_allclose(together.reward[:, own], single.reward, rtol=1e-3, atol=1e-5)
-        np.testing.assert_allclose(
-            together.observation.joints[:, own, :joints],
-            single.observation.joints,
-            rtol=1e-3,
-            atol=1e-4,
-        )
-        assert np.all(together.observation.joints[:, own, joints:] == 0)
-    mixed.config = mixed_config
+        for part, count in (("joints", robot.num_actuators), ("feet", robot.num_feet)):
+            padded = getattr(together.observation, part)[:, own]
+            expected = getattr(single.observation, part)
+            np.testing.assert_allclose(padded[:, :, :count], expected, **close, err_msg=name)
+            assert np.all(padded[:, :, count:] == 0)
 
 
-def test_the_builder_makes_these_files(tmp_path):
-    """The builder's own checks on a small fact sheet that is written here."""
-    path = data_dir() / "robots" / "build.py"
-    spec = importlib.util.spec_from_file_location("build", path)
-    build = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(build)
-    assert build.number(0.1) == "0.1" and build.number(-0.0) == "0" and build.number(2) == "2"
-    assert build.foot_name("FL") == "FL_foot" and build.foot_name("LeftFoot") == "Leftfoot"
+def test_files_are_what_the_builder_makes_of_the_sheets():
+    folder = data_dir() / "robots"
+    spec = importlib.util.spec_from_file_location("build", folder / "build.py")
+    builder = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(builder)
+    sheets = {path.stem: json.loads(path.read_text()) for path in folder.glob("sheets/*.json")}
+    assert sorted(sheets) == robots()
+    for name, sheet in sheets.items():
+        assert builder.build(sheet) == (folder / f"{name}.xml").read_text(), name
+    licences = json.loads((folder / "licences.json").read_text())
+    ordered = [sheets[name] for name in sorted(sheets)]
+    assert builder.sources(ordered, licences) == (folder / "SOURCES.md").read_text()

@@ -321,3 +321,11 @@ def test_engines_agree_on_the_task(go2):
     np.testing.assert_allclose(c.observation.joints, mjx.observation.joints, atol=2e-3)
     np.testing.assert_allclose(c.observation.feet, mjx.observation.feet, atol=0.05)
     np.testing.assert_allclose(c.reward, mjx.reward, atol=2e-3)
+
+
+def test_other_settings_share_what_starts_episodes(go2):
+    env = Locomotion(go2, 2, config=TaskConfig(**QUIET), threads=1, engine="native")
+    fixed = env.with_task(replace(env.config, fixed_coefficient=True))
+    assert fixed.groups is env.groups and not env.config.fixed_coefficient
+    with pytest.raises(ValueError, match="initial_tilt is 0.5 instead of"):
+        env.with_task(replace(env.config, initial_tilt=0.5))

@@ -1,9 +1,17 @@
 """Turn robot fact sheets (JSON) into MJCF files.
 
-    python data/robots/build.py <folder of fact sheets> [names...] [--out FOLDER]
+    python data/robots/build.py [names...] [--sheets FOLDER] [--out FOLDER]
 
-Without names every sheet of the folder is built. SOURCES.md in the output folder is rewritten for
-all robots that have both a sheet and an MJCF file. The result depends on the sheets only.
+Without names every sheet is built. SOURCES.md in the output folder is rewritten for all robots that
+have both a sheet and an MJCF file. The result depends on the sheets only.
+
+A sheet holds numbers only, in SI units and radians, quaternions (w, x, y, z). paper: gains, action
+scale and counts that the paper prints. bodies: kinematic tree from the floating body "trunk", pos
+and quat in the parent's frame, inertia as in MuJoCo (principal moments), shapes for looks only.
+joints: hinges; actuated ones carry torque_limit (N m), velocity_limit (rad/s) and nominal position;
+actuator_order is the order of actions. feet: the only geoms that touch the floor.
+collision_spheres: for self-collision. imu_pos: in the trunk's frame. keep_nominal: joints that
+should stay where they are (arms, head, waist). sources, estimated, notes: where it comes from.
 """
 
 import argparse
@@ -335,9 +343,10 @@ def write(path: Path, text: str) -> None:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("sheets", type=Path, help="folder with one JSON file per robot")
+    here = Path(__file__).resolve().parent
     parser.add_argument("names", nargs="*", help="robots to build; default all")
-    parser.add_argument("--out", type=Path, default=Path(__file__).resolve().parent)
+    parser.add_argument("--sheets", type=Path, default=here / "sheets", help="one JSON per robot")
+    parser.add_argument("--out", type=Path, default=here)
     arguments = parser.parse_args()
     sheets = {path.stem: path for path in sorted(arguments.sheets.glob("*.json"))}
     unknown = [name for name in arguments.names if name not in sheets]

@@ -29,6 +29,9 @@ RESET_SLOTS = 16
 """Finished environments are restarted in chunks of this size, so that one compiled
 function serves any number of them."""
 
+START_SETTINGS = ("horizon", "command", "initial", "action_delay", "mixed_delay")
+"""Beginnings of the names of those fields of TaskConfig that the start of an episode depends on."""
+
 Policy = Callable[[Any, jax.Array, Descriptions, Observation], tuple[jax.Array, Any]]
 """(params, key, descriptions[N], observation[N]) -> (action[N, J], extra pytree[N])."""
 
@@ -152,6 +155,9 @@ class Locomotion:
             Without it a finished environment idles.
         threads: physics threads of the native engine, 0 for all cores.
         physics_options: passed on to the engine's constructor.
+
+    The function that starts episodes is compiled for each robot, some seconds each; it then holds
+    about 700 memory maps, of the 65,530 that Linux grants a process.
 
     Raises:
         ValueError: for an unknown engine, or fewer environments than robots.
@@ -288,14 +294,24 @@ class Locomotion:
             parts.append(jax.tree.map(np.asarray, (state.descriptions, embodiment)))
         return jax.tree.map(lambda *x: np.concatenate(x)[: len(designs)], *parts)
 
-    def at_fixed_coefficient(self) -> "Locomotion":
-        """The same environments with a curriculum coefficient that stays as it is at the reset.
+    def with_task(self, config: TaskConfig) -> "Locomotion":
+        """The same environments with other settings of the task.
 
-        They share physics and compiled functions: `reset` or `restore` one before using it after
-        the other.
+        They share physics and the compiled functions that start episodes: `reset` or `restore` one
+        before using it after the other.
+
+        Raises:
+            ValueError: if a setting differs that the start of an episode depends on.
         """
+        for name in vars(config):
+            old, new = getattr(self.config, name), getattr(config, name)
+            if name.startswith(START_SETTINGS) and old != new:
+                raise ValueError(
+                    f"{name} is {new!r} instead of {old!r}; episodes would start in another way: "
+                    "create another Locomotion"
+                )
         other = copy.copy(self)
-        other.config = replace(self.config, fixed_coefficient=True)
+        other.config = config
         other._advance_jit = jax.jit(other._advance)
         other._steps = {}
         return other
