@@ -233,21 +233,24 @@ def main():
             command, env=environment, check=True, stdout=subprocess.PIPE, text=True
         ).stdout
         for label, (value, unit) in json.loads(output.splitlines()[-1]).items():
-            rows[label] = {"value": value, "unit": unit}
+            rows[label] = {"value": value, "unit": unit, "benchmark": name}
             print(f"{label:52s} {value:12,.2f} {unit}", flush=True)
     for name in ("C engine alone", "C engine inside it"):
         if {name, "environment, C engine"} <= rows.keys():
             label = f"environment / {name}"
             ratio = rows["environment, C engine"]["value"] / rows[name]["value"]
-            rows[label] = {"value": ratio, "unit": ""}
+            rows[label] = {"value": ratio, "unit": "", "benchmark": "environment"}
             print(f"{label:52s} {ratio:12.2f}")
     from shapebody.experiments import provenance
 
     source = provenance(robot=ROBOT, environments=ENVIRONMENTS)
     rows = {label: {**row, "commit": source["commit"]} for label, row in rows.items()}
     if os.path.exists(options.out):  # benchmarks that did not run this time keep their rows
+        ran = {row["benchmark"] for row in rows.values()}
         with open(options.out) as file:
-            rows = {**json.load(file)["rows"], **rows}
+            old = json.load(file)["rows"].items()
+        kept = {label: row for label, row in old if row.get("benchmark", "import") not in ran}
+        rows = {**kept, **rows}
     record = {"rows": rows, "provenance": source}
     temporary = options.out + ".tmp"
     with open(temporary, "w") as file:

@@ -66,12 +66,13 @@ def main(arguments=None) -> int:
 
 def _train(options):
     from shapebody.experiments import scale
-    from shapebody.ppo import TrainConfig, train
+    from shapebody.ppo import TrainConfig, as_continued, train
 
     changes = {"robots": tuple(options.robots)}
     if options.name:
         changes["name"] = options.name
     config = TrainConfig.at_scale(options.scale or scale(), options.robots[0], **changes)
+    config = as_continued(config)
     seconds = None if options.hours is None else 3600 * options.hours
     agent = train(config, max_steps=options.steps, max_seconds=seconds, engine=options.engine)
     print(f"agent {agent.name}: {agent.metadata['steps']:,} steps")

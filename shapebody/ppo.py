@@ -757,6 +757,17 @@ SCHEDULE = ("total_steps", "epochs", "minibatch_size", "learning_rate", "state_b
 """Fields that may change when a run is continued; each change is recorded."""
 
 
+def as_continued(config: TrainConfig, folder=None) -> TrainConfig:
+    """`config` with the schedule of the run in its folder, if there is one to continue."""
+    folder = Path(folder) if folder else data_dir() / "checkpoints" / config.name
+    try:
+        last = json.loads((folder / "training.json").read_text())[-1]["config"]
+    except (OSError, ValueError, LookupError, TypeError):
+        return config  # nothing to continue, or a damaged file, which `Trainer.start` reports
+    schedule = {name: last.get(name, getattr(config, name)) for name in SCHEDULE}
+    return replace(config, **schedule | {"learning_rate": tuple(schedule["learning_rate"])})
+
+
 def _robot_hash(robot) -> str:
     return hashlib.sha256(robot.xml.encode()).hexdigest()[:16]
 

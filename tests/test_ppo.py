@@ -116,6 +116,9 @@ def test_a_run_continues_only_with_its_own_configuration(config, tmp_path):
     longer = ppo.Trainer(replace(config, epochs=1), tmp_path)
     assert longer.start()
     assert [phase["from_step"] for phase in longer.phases] == [0, 128]
+    longer.save()
+    assert ppo.as_continued(config, tmp_path).epochs == 1
+    assert ppo.as_continued(config, tmp_path / "nothing") == config
     longer.phases[0]["robots"]["unitree_go2"] = "another file"
     longer.save()
     with pytest.raises(ValueError, match="file of robot unitree_go2 has changed"):
