@@ -30,13 +30,18 @@ def solid(model, group) -> list[int]:
     return [i for i in group if model.geom_type[i] not in MESHES] or group
 
 
-def leg_ends(model, qpos) -> dict[int, list[int]]:
-    """Moving body -> geom ids of its lowest geoms, for bodies at the end of a leg in pose qpos."""
+def leg_ends(model, qpos, reach: float = 0.2) -> dict[int, list[int]]:
+    """Moving body -> geom ids of its lowest geoms, for bodies at the end of a leg in pose qpos.
+
+    Those are the outermost bodies that come as close to the lowest of them as `reach` times the
+    standing height.
+    """
     data = mujoco.MjData(model)
     data.qpos[:] = qpos
     mujoco.mj_kinematics(model, data)
     moving = model.body_weldid
     parents = {int(moving[model.body_parentid[body]]) for body in np.unique(moving) if body}
+    height = standing_height(model, data)
     heights, chosen = {}, {}
     for body in (int(body) for body in np.unique(moving) if body and body not in parents):
         group = np.flatnonzero(moving[model.geom_bodyid] == body)
@@ -44,20 +49,39 @@ def leg_ends(model, qpos) -> dict[int, list[int]]:
         touching = [i for i in shapes if model.geom_contype[i] or model.geom_conaffinity[i]]
         group = touching or shapes
         if group:
-            chosen[body] = lowest_geoms(model, data, group)
+            chosen[body] = lowest_geoms(model, data, group, height)
             heights[body] = lowest(model, data, chosen[body][0])
     if not heights:
         return {}
     floor = min(heights.values())
-    height = data.xpos[1, 2] - floor
-    return {body: group for body, group in chosen.items() if heights[body] <= floor + 0.2 * height}
+    return {
+        body: group for body, group in chosen.items() if heights[body] <= floor + reach * height
+    }
 
 
-def lowest_geoms(model, data, group) -> list[int]:
-    """The geoms of a group that are as low as the lowest, up to 2 % of the height of the trunk."""
+def ends_without_foot(model, qpos) -> dict[int, list[int]]:
+    """As `leg_ends`, for those at the height of the floor that have no foot."""
+    footed = set(model.body_weldid[model.geom_bodyid[foot_ids(model)]].tolist())
+    ends = leg_ends(model, qpos, reach=0.05)
+    return {body: group for body, group in ends.items() if body not in footed}
+
+
+def standing_height(model, data) -> float:
+    """Height of the centre of mass above the lowest geom of the robot, m; at least 1 mm.
+
+    Unlike the height of the trunk, it does not depend on where the trunk has its origin.
+    """
+    mujoco.mj_comPos(model, data)
+    geoms = np.flatnonzero(model.geom_bodyid)
+    bottom = min((lowest(model, data, i) for i in geoms), default=0.0)
+    return float(max(data.subtree_com[1, 2] - bottom, 1e-3))
+
+
+def lowest_geoms(model, data, group, height: float) -> list[int]:
+    """The geoms of a group that are as low as the lowest, up to 2 % of the standing height."""
     bottom = {int(i): lowest(model, data, i) for i in group}
     least = min(bottom.values())
-    return [i for i in bottom if bottom[i] <= least + 0.02 * (data.xpos[1, 2] - least)]
+    return [i for i in bottom if bottom[i] <= least + 0.02 * height]
 
 
 def lowest(model, data, geom: int) -> float:

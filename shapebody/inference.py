@@ -25,6 +25,7 @@ from shapebody.feet import (
     lowest_geoms,
     shape_name,
     solid,
+    standing_height,
 )
 from shapebody.reading import IMU, VELOCITY_LIMIT
 from shapebody.specs import (
@@ -206,8 +207,10 @@ def infer_feet(spec, model) -> Iterator[str]:
         return
     data = _home_data(model)
     if named:
+        height = standing_height(model, data)
         groups = {
-            body: lowest_geoms(model, data, solid(model, group)) for body, group in named.items()
+            body: lowest_geoms(model, data, solid(model, group), height)
+            for body, group in named.items()
         }
     else:
         groups = leg_ends(model, data.qpos)
@@ -491,8 +494,19 @@ def infer_contacts(spec, model) -> Iterator[str]:
 
 def infer_floor(spec, model) -> Iterator[str]:
     """A plane geom "floor" at z = 0."""
+    level = dict(position=[0, 0, 0], quaternion=[1, 0, 0, 0])
     planes = [geom for geom in spec.worldbody.geoms if geom.type == _GEOM.mjGEOM_PLANE]
-    if any(geom.name == "floor" for geom in planes):
+    for geom in (geom for geom in planes if geom.name == "floor"):
+        height, normal = model.geom_pos[geom.id, 2], np.zeros(3)
+        mujoco.mju_rotVecQuat(normal, np.array([0.0, 0, 1]), model.geom_quat[geom.id])
+        tilt = np.degrees(np.arccos(np.clip(normal[2], -1, 1)))
+        if abs(height) > 1e-6 or tilt > 0.01:
+            replace_geom(spec, geom, geom.type, geom.size, **level)
+            yield (
+                f'the plane "floor" is at z = {height:g} m and tilted by {tilt:.3g} degrees: the '
+                "method walks on level ground at z = 0, and the plane is put there; to say it "
+                "yourself remove its position and orientation"
+            )
         return
     for geom in spec.geoms:
         if geom.name == "floor":
@@ -500,7 +514,7 @@ def infer_floor(spec, model) -> Iterator[str]:
     if planes:
         was = planes[0].name
         rename_geom(spec, planes[0], "floor")
-        planes[0].pos, planes[0].quat = [0, 0, 0], [1, 0, 0, 0]
+        replace_geom(spec, planes[0], planes[0].type, planes[0].size, **level)
         yield f'no geom "floor": the plane {was!r} is the floor; to say it yourself rename it'
     else:
         yield add_floor(spec)

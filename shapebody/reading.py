@@ -6,6 +6,7 @@ velocity limits and feet from its own elements.
 
 import re
 import xml.etree.ElementTree as ElementTree
+from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -37,7 +38,7 @@ def read(path: Path) -> tuple[str, mujoco.MjSpec, mujoco.MjModel, list[str]]:
     Raises ValueError, naming the fix, for a file that is no text, empty, cut off or not valid.
     """
     try:
-        text = path.read_bytes().decode("utf-8")
+        text = path.read_bytes().decode("utf-8-sig")
     except UnicodeDecodeError as error:
         raise ValueError(
             f"{path} is not UTF-8 text (byte {error.start} is {error.object[error.start]:#04x}): "
@@ -52,20 +53,26 @@ def read(path: Path) -> tuple[str, mujoco.MjSpec, mujoco.MjModel, list[str]]:
             "'xacro FILE > robot.urdf', where ROS is installed"
         )
     root = re.search(r"<([A-Za-z_][\w:.-]*)", re.sub(r"<!--.*?-->", "", text, flags=re.DOTALL))
-    urdf = root.group(1) == "robot" if root else path.suffix == ".urdf"
+    urdf = root.group(1) == "robot" if root else path.suffix.lower() == ".urdf"
     notes = []
+    if urdf:
+        notes.append("the file is a URDF: it is imported by MuJoCo and completed as MJCF")
+        text = _prepared_urdf(path, text, notes)
     try:
         if urdf:
             spec = _import_urdf(path, text, notes)
-        else:
+        elif path.suffix == ".xml":
             spec = mujoco.MjSpec.from_file(str(path))
+        else:  # MuJoCo knows a file by this ending only
+            spec = mujoco.MjSpec.from_string(text)
+            spec.modelfiledir = str(path.parent.absolute())
         name_parts(spec)
         model = _compile(spec, notes)
         if urdf:
             model = _float(spec, model, text, notes)
     except ValueError as error:
         kind = "URDF" if urdf else "MJCF"
-        raise ValueError(f"{path} is not a valid {kind} file: {_explained(error, kind)}") from error
+        raise ValueError(f"{path} is not a valid {kind} file: {_explained(error)}") from error
     if re.search(r"<include\s", text):
         notes.append("other files are included: their text is merged into the completed file")
     return text, spec, model, notes
@@ -77,14 +84,21 @@ _FIXES = {
     "qpos size": "give each keyframe as many numbers as the robot has positions (7 for the free "
     "joint, then 1 per hinge); if it has them, the trunk lacks its <freejoint/>",
     "balanceinertia": 'correct the inertia, or let <compiler balanceinertia="true"/> repair it',
-    "XML": "expected a complete XML file; it may be cut off, so look at the place that is named",
+    "top level": "the base floats by itself: remove the link above the floating joint, and the "
+    "joint; between links that move give the joint type revolute",
+    "opening file": "put the included file where the text says; a file that includes others must "
+    "have a name that ends in '.xml'",
+    "model type": "expected <mujoco> (MJCF) or <robot> (URDF) as the first element: this is "
+    "another kind of file",
+    "XML parse error": "expected a complete XML file; it may be cut off, so look at the place that "
+    "is named",
+    "root element not found": "expected a complete XML file with a <mujoco> or <robot> root",
 }
 
 
-def _explained(error: Exception, kind: str) -> str:
+def _explained(error: Exception) -> str:
     reason = " ".join(str(error).split())
-    root = {"MJCF": "<mujoco>", "URDF": "<robot>"}[kind]
-    default = f"Expected a complete XML file with a {root} root; correct the reported element"
+    default = "correct the reported element"
     fix = next((fix for part, fix in _FIXES.items() if part in reason), default)
     return f"MuJoCo reports {reason!r}. {fix[0].upper()}{fix[1:]}"
 
@@ -127,6 +141,102 @@ def _compile(spec, notes) -> mujoco.MjModel:
     raise first
 
 
+def _prepared_urdf(path: Path, text: str, notes) -> str:
+    """The text of a checked URDF whose first link is the base.
+
+    Links are often put above the base for the navigation of wheeled robots ("base_footprint").
+    """
+    root = _urdf_root(text)
+    if root is None:
+        return text
+    _check_urdf(path, root)
+    dropped = []
+    while (link := _empty_root(root)) is not None:
+        (joint,) = [joint for joint in root.findall("joint") if _end(joint, "parent") == link]
+        dropped.append(link)
+        base = _end(joint, "child")
+        for element in root.findall("link"):
+            if element.get("name") == link:
+                root.remove(element)
+        root.remove(joint)
+    if not dropped:
+        return text
+    notes.append(
+        f"links {listed(dropped)} above {base!r} have no mass, no geometry and nothing else to "
+        f"carry: {base!r} is the base, with its origin as that of the trunk"
+    )
+    return ElementTree.tostring(root, encoding="unicode")
+
+
+def _check_urdf(path: Path, root):
+    """Raises ValueError for what MuJoCo's importer does not notice."""
+    repeated = [
+        f"repeated name {name!r} in {kind} ({count} of them)"
+        for kind in ("link", "joint")
+        for name, count in Counter(part.get("name") for part in root.findall(kind)).items()
+        if name and count > 1
+    ]
+    wrong: dict[str, list[str]] = {}
+    for joint, velocity in _urdf_velocities(root):
+        if not np.isfinite(_number(velocity)):
+            wrong.setdefault(velocity, []).append(repr(joint))
+    reasons = []
+    if repeated:
+        reasons.append(f"{listed(repeated)}. {_FIXES['repeated name'].capitalize()}")
+    for velocity, joints in wrong.items():
+        reasons.append(
+            f"velocity of {'joint' if len(joints) == 1 else 'joints'} {listed(joints)} is "
+            f"{velocity!r}: expected a number (rad/s); write it, or expand the xacro template that "
+            "the file comes from"
+        )
+    if reasons:
+        raise ValueError(f"{path} is not a valid URDF file: {'; '.join(reasons)}")
+
+
+def _urdf_root(text: str):
+    """Root element of a URDF; None if MuJoCo's more lenient parser has to read it alone."""
+    try:
+        return ElementTree.fromstring(text)
+    except ElementTree.ParseError:
+        return None
+
+
+def _end(joint, kind: str) -> str | None:
+    """Name of the "parent" or "child" link of a URDF joint."""
+    element = joint.find(kind)
+    return None if element is None else element.get("link")
+
+
+def _empty_root(root) -> str | None:
+    """Name of the root link if it is only a frame: no mass, no geometry, one fixed child."""
+    joints = root.findall("joint")
+    children = {_end(joint, "child") for joint in joints}
+    tops = [link for link in root.findall("link") if link.get("name") not in children]
+    if len(tops) != 1:
+        return None
+    below = [joint for joint in joints if _end(joint, "parent") == tops[0].get("name")]
+    mass, origin = tops[0].find("inertial/mass"), below[0].find("origin") if below else None
+    turn = "0" if origin is None else origin.get("rpy", "0")
+    if (
+        [joint.get("type") for joint in below] != ["fixed"]
+        or _end(below[0], "child") not in {link.get("name") for link in root.findall("link")}
+        or tops[0].find("visual") is not None
+        or tops[0].find("collision") is not None
+        or any(_number(angle) != 0 for angle in turn.split())  # it says what is up
+        or (mass is not None and _number(mass.get("value", "0")) != 0)
+    ):
+        return None
+    return tops[0].get("name")
+
+
+def _number(text: str) -> float:
+    """The number that a text is; NaN if it is none."""
+    try:
+        return float(text)
+    except ValueError:
+        return float("nan")
+
+
 def _import_urdf(path: Path, text: str, notes) -> mujoco.MjSpec:
     if not re.search(r"<mujoco[\s>]", text):
         settings = '<mujoco><compiler fusestatic="false" discardvisual="false"/></mujoco>'
@@ -135,7 +245,6 @@ def _import_urdf(path: Path, text: str, notes) -> mujoco.MjSpec:
     spec.modelfiledir = str(path.parent.absolute())
     spec.compiler.fusestatic = False
     spec.compiler.discardvisual = False
-    notes.append("the file is a URDF: it is imported by MuJoCo and completed as MJCF")
     spec.compiler.balanceinertia = True  # many URDFs have inertias that no body can have
     for body in spec.bodies[1:]:
         xx, yy, zz, xy, xz, yz = body.fullinertia
@@ -206,7 +315,9 @@ def _float(spec, model, text, notes) -> mujoco.MjModel:
             'armature="..."/>'
         )
     model = _compile(spec, notes)
-    speeds = _urdf_velocities(text)
+    root = _urdf_root(text)
+    speeds = {} if root is None else {name: float(v) for name, v in _urdf_velocities(root)}
+    speeds = {name: speed for name, speed in speeds.items() if speed > 0}
     hinges = [joint.name for joint in ordered(spec.joints) if joint.type == _JOINT.mjJNT_HINGE]
     if any(name in speeds for name in hinges):
         data = [speeds.get(name, VELOCITY_LIMIT) for name in hinges]
@@ -250,15 +361,9 @@ def _feet_of_links(spec, fixed) -> Iterator[str]:
         )
 
 
-def _urdf_velocities(text: str) -> dict[str, float]:
-    """Velocity limits > 0 by joint; MuJoCo's importer has no place for them."""
-    speeds = {}
-    try:
-        root = ElementTree.fromstring(text)
-    except ElementTree.ParseError:  # MuJoCo's parser is more lenient
-        return {}
-    for joint in root.iter("joint"):
+def _urdf_velocities(root) -> Iterator[tuple[str, str]]:
+    """Joints and the texts of their velocity limits; MuJoCo's importer has no place for them."""
+    for joint in root.findall("joint"):
         limit = joint.find("limit")
-        if limit is not None and float(limit.get("velocity", 0)) > 0:
-            speeds[joint.get("name")] = float(limit.get("velocity"))
-    return speeds
+        if limit is not None and limit.get("velocity") is not None:
+            yield joint.get("name"), limit.get("velocity")

@@ -6,6 +6,7 @@ inferred from the rest of it (`shapebody.inference`). All arrays of `Robot` are 
 """
 
 import difflib
+import os
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,16 +14,17 @@ from pathlib import Path
 import mujoco
 import numpy as np
 
-from shapebody.feet import foot_ids
+from shapebody.feet import ends_without_foot, foot_ids, lowest, standing_height
 from shapebody.inference import complete
 from shapebody.paths import data_dir
 from shapebody.reading import read
-from shapebody.specs import COLLISION_GROUP
+from shapebody.specs import COLLISION_GROUP, each, listed
 
 FOOT_SPHERE, FOOT_BOX = 0, 1
 PAIR_FRICTION = (1.0, 1.0, 0.005, 0.0001, 0.0001)
 SUFFIXES = (".xml", ".urdf", ".mjcf")
 MIN_MASS, MIN_INERTIA = 1e-7, 1e-11  # kg, kg m²; those of real robots are above 1e-6 and 1e-10
+MAX_TILT = 45.0  # degrees of the trunk in "home"
 
 _OBJ, _JOINT, _SENSOR = mujoco.mjtObj, mujoco.mjtJoint, mujoco.mjtSensor
 
@@ -129,8 +131,9 @@ def robots() -> list[str]:
 def load_robot(name_or_path: str | Path) -> Robot:
     """Load a robot by name (see `robots()`) or from an MJCF or URDF file.
 
-    A string that ends in ".xml" or ".urdf" and any Path is a file. What the file lacks is inferred
-    where that is possible; `Robot.inferred` says what, and `shapebody.validate_robot` shows it.
+    Any Path is a file, and so is a string that ends in ".xml" or ".urdf", contains a "/", or names
+    an existing file but no shipped robot. What the file lacks is inferred where that is possible;
+    `Robot.inferred` says what, and `shapebody.validate_robot` shows it.
 
     Raises ValueError for an unknown name, for text that MuJoCo cannot compile and for a model that
     does not fit (every problem is listed); FileNotFoundError for a missing file.
@@ -149,27 +152,30 @@ def find(name_or_path: str | Path) -> Path:
         raise TypeError(
             f"load_robot expects a robot name or a path, got {type(name_or_path).__name__}"
         )
-    if isinstance(name_or_path, Path) or name_or_path.endswith((*SUFFIXES, "/")):
-        path = Path(name_or_path).expanduser()
-        if path.is_dir():
-            files = sorted(file.name for file in path.iterdir() if file.suffix in SUFFIXES)
-            inside = f"one of its files: {', '.join(files[:8])}" if files else "an MJCF file"
-            raise ValueError(f"{path} is a folder: expected a file; give the path of {inside}")
-        if not path.is_file():
-            raise FileNotFoundError(
-                f"robot file {str(name_or_path)!r} does not exist (looked at {path.absolute()}): "
-                "give the path of an MJCF or URDF file, or one of the names of shapebody.robots()"
+    text = str(name_or_path)
+    looks_like_a_path = "/" in text or os.sep in text or text.lower().endswith(SUFFIXES)
+    if isinstance(name_or_path, str) and not looks_like_a_path:
+        names = robots()
+        if text in names:
+            return data_dir() / "robots" / f"{text}.xml"
+        if not os.path.exists(text):
+            close = difflib.get_close_matches(text, names, n=3, cutoff=0.5)
+            hint = f" Did you mean {' or '.join(map(repr, close))}?" if close else ""
+            raise ValueError(
+                f"unknown robot {text!r}.{hint} Available robots: {', '.join(names) or 'none'}. "
+                "For a file of your own give its path, e.g. 'my_robot.xml' or 'my_robot.urdf'"
             )
-        return path
-    names = robots()
-    if name_or_path not in names:
-        close = difflib.get_close_matches(name_or_path, names, n=3, cutoff=0.5)
-        hint = f" Did you mean {' or '.join(map(repr, close))}?" if close else ""
-        raise ValueError(
-            f"unknown robot {name_or_path!r}.{hint} Available robots: {', '.join(names) or 'none'}."
-            " For a file of your own give its path, ending in '.xml' or '.urdf'"
+    path = Path(text).expanduser()
+    if path.is_dir():
+        files = sorted(f.name for f in path.iterdir() if f.suffix.lower() in SUFFIXES)
+        inside = f"one of its files: {', '.join(files[:8])}" if files else "an MJCF file"
+        raise ValueError(f"{path} is a folder: expected a file; give the path of {inside}")
+    if not path.is_file():
+        raise FileNotFoundError(
+            f"robot file {text!r} does not exist (looked at {path.absolute()}): "
+            "give the path of an MJCF or URDF file, or one of the names of shapebody.robots()"
         )
-    return data_dir() / "robots" / f"{name_or_path}.xml"
+    return path
 
 
 def examine(path: Path) -> tuple[Robot | None, list[str], tuple[str, ...]]:
@@ -186,7 +192,7 @@ def examine(path: Path) -> tuple[Robot | None, list[str], tuple[str, ...]]:
         text = spec.to_xml()
         spec = mujoco.MjSpec.from_string(text)
         model = spec.compile()
-    problems = [message for check in (*CHECKS, check_feet) for message in check(model)]
+    problems = [message for check in (*CHECKS, check_feet, check_home) for message in check(model)]
     if problems:
         return None, problems, tuple(notes)
     if _add_sensors(spec, model):
@@ -215,31 +221,42 @@ def check_tree(model: mujoco.MjModel) -> Iterator[str]:
             f"the free joint is in body {body}: expected it in the first body; "
             "make the trunk the first body of the worldbody"
         )
-    for body in range(2, model.nbody):
-        if model.body_rootid[body] != 1 and model.body_parentid[body] == 0:
-            yield (
-                f"body {_name(model, _OBJ.mjOBJ_BODY, body)} is not part of the robot: "
-                "expected one tree below the trunk; remove it or attach it"
-            )
+    loose = [body for body in range(2, model.nbody) if model.body_parentid[body] == 0]
+    if loose:
+        names = (_name(model, _OBJ.mjOBJ_BODY, body) for body in loose)
+        yield (
+            f"{each('body', names)} is not part of the robot: "
+            "expected one tree below the trunk; remove or attach what is beside it"
+        )
 
 
 def check_joints(model: mujoco.MjModel) -> Iterator[str]:
     """Hinge joints with limits."""
-    kinds = {_JOINT.mjJNT_BALL: "ball", _JOINT.mjJNT_SLIDE: "slide"}
+    found: dict[str, list[str]] = {}
     for joint in range(model.njnt):
-        kind = mujoco.mjtJoint(model.jnt_type[joint])
-        name = _name(model, _OBJ.mjOBJ_JOINT, joint)
-        if kind in kinds:
+        kind, (low, high) = _JOINT(model.jnt_type[joint]), model.jnt_range[joint]
+        if kind == _JOINT.mjJNT_HINGE and not (model.jnt_limited[joint] and low < high):
+            finding = f"{low:g} {high:g}" if low or high else "none"
+        else:
+            finding = {_JOINT.mjJNT_BALL: "ball", _JOINT.mjJNT_SLIDE: "slide"}.get(kind)
+        found.setdefault(finding, []).append(_name(model, _OBJ.mjOBJ_JOINT, joint))
+    found.pop(None, None)
+    for finding, names in found.items():
+        if finding in ("ball", "slide"):
             yield (
-                f"joint {name} is a {kinds[kind]} joint: expected hinge joints only; "
-                "replace it by hinges or remove it"
+                f"{each('joint', names)} is a {finding} joint: "
+                "expected hinge joints only; replace by hinges or remove"
             )
-        elif kind == _JOINT.mjJNT_HINGE and not (
-            model.jnt_limited[joint] and model.jnt_range[joint, 0] < model.jnt_range[joint, 1]
-        ):
+        elif finding == "none":
             yield (
-                f'joint {name} has no limits: expected range="lower upper" with lower < upper; '
-                "add the range of the real joint (in a URDF, type revolute with <limit>)"
+                f'{each("joint", names)} has no limits: expected range="lower upper" with lower < '
+                "upper; add the range of the real joint (in a URDF, type revolute with <limit>)"
+            )
+        else:
+            yield (
+                f'{each("joint", names)} has range="{finding}", which is no limit: expected lower '
+                '< upper and no limited="false"; correct the range (in a URDF, lower and upper of '
+                "<limit>)"
             )
 
 
@@ -253,17 +270,20 @@ def check_numbers(model: mujoco.MjModel) -> Iterator[str]:
         (("key_qpos",), _OBJ.mjOBJ_KEY),
     ):
         for field in fields:
-            values = getattr(model, field)
-            for index in (i for i, value in enumerate(values) if not np.isfinite(value).all()):
+            found: dict[str, list[str]] = {}
+            for index, value in enumerate(getattr(model, field)):
+                if not np.isfinite(value).all():
+                    found.setdefault(_shown(value), []).append(_name(model, kind, index))
+            for shown, names in found.items():
                 yield (
-                    f"{field} of {_name(model, kind, index)} is {_shown(values[index])}: expected "
-                    "finite numbers; correct the element"
+                    f"{field} of {listed(names)} is {shown}: expected finite numbers; correct it"
                 )
 
 
 def check_masses(model: mujoco.MjModel) -> Iterator[str]:
     """Bodies that move have mass and inertia."""
     moving = model.body_weldid
+    found: dict[str, list[str]] = {}
     for body in range(1, model.nbody):
         if model.body_dofnum[body] == 0:
             continue
@@ -272,12 +292,14 @@ def check_masses(model: mujoco.MjModel) -> Iterator[str]:
         if not (mass >= MIN_MASS and inertia >= MIN_INERTIA):
             # What is below 1e-9 is what `read` put in place of nothing.
             shown = f"{mass if mass > 1e-9 else 0:g} kg and {inertia if inertia > 1e-13 else 0:g}"
-            yield (
-                f"body {_name(model, _OBJ.mjOBJ_BODY, body)} has mass and inertia {shown} kg m²: "
-                f"expected at least {MIN_MASS:g} and {MIN_INERTIA:g} for a body that moves; add "
-                '<inertial pos="..." mass="..." diaginertia="..."/> (in a URDF, <inertial> with '
-                "<mass> and <inertia>)"
-            )
+            found.setdefault(shown, []).append(_name(model, _OBJ.mjOBJ_BODY, body))
+    for shown, names in found.items():
+        yield (
+            f"{each('body', names)} has mass and inertia {shown} kg m²: expected at least "
+            f"{MIN_MASS:g} and {MIN_INERTIA:g} for a body that moves; add "
+            '<inertial pos="..." mass="..." diaginertia="..."/> (in a URDF, <inertial> with '
+            "<mass> and <inertia>)"
+        )
 
 
 def check_loops(model: mujoco.MjModel) -> Iterator[str]:
@@ -285,14 +307,26 @@ def check_loops(model: mujoco.MjModel) -> Iterator[str]:
     for kind in np.unique(model.eq_type):
         label = mujoco.mjtEq(kind).name.removeprefix("mjEQ_").lower()
         ids = np.flatnonzero(model.eq_type == kind)
-        names = ", ".join(_name(model, _OBJ.mjOBJ_EQUALITY, index) for index in ids[:6])
+        names = [_constraint(model, int(index)) for index in ids]
         yield (
-            f"{len(ids)} equality constraints of type {label} ({names}): expected none, since a "
-            "design would pull the constrained parts apart; drive the joints directly (a mimic "
-            "joint: by an actuator of its own, or make it fixed)"
+            f"{len(ids)} equality constraints of type {label} ({listed(names)}): expected none, "
+            "since a design would pull the constrained parts apart; drive the joints directly (a "
+            "mimic joint: by an actuator of its own, or make it fixed)"
         )
     if model.nflex:
         yield f"{model.nflex} flexible bodies: expected rigid bodies only; remove <flexcomp>"
+
+
+def _constraint(model: mujoco.MjModel, index: int) -> str:
+    """Name of an equality constraint, or what it ties to what."""
+    if model.eq(index).name:
+        return repr(model.eq(index).name)
+    kind = {
+        mujoco.mjtEq.mjEQ_JOINT: _OBJ.mjOBJ_JOINT,
+        mujoco.mjtEq.mjEQ_TENDON: _OBJ.mjOBJ_TENDON,
+    }.get(mujoco.mjtEq(model.eq_type[index]), _OBJ(model.eq_objtype[index]))
+    ends = (model.eq_obj1id[index], model.eq_obj2id[index])
+    return " with ".join(_name(model, kind, end) for end in ends if end >= 0)
 
 
 def check_actuators(model: mujoco.MjModel) -> Iterator[str]:
@@ -303,6 +337,7 @@ def check_actuators(model: mujoco.MjModel) -> Iterator[str]:
             '<joint axis="..." range="..."/> to the bodies that move, and an <actuator> section'
         )
     driven: dict[int, str] = {}
+    others = []
     for actuator in range(model.nu):
         name = _name(model, _OBJ.mjOBJ_ACTUATOR, actuator)
         joint = int(model.actuator_trnid[actuator, 0])
@@ -311,10 +346,7 @@ def check_actuators(model: mujoco.MjModel) -> Iterator[str]:
             not in (mujoco.mjtTrn.mjTRN_JOINT, mujoco.mjtTrn.mjTRN_JOINTINPARENT)
             or model.jnt_type[joint] != _JOINT.mjJNT_HINGE
         ):
-            yield (
-                f'actuator {name} does not drive one hinge joint: expected joint="<hinge>"; '
-                "replace tendon, site, body or free-joint transmissions"
-            )
+            others.append(name)
             continue
         if joint in driven:
             yield (
@@ -322,11 +354,27 @@ def check_actuators(model: mujoco.MjModel) -> Iterator[str]:
                 f"{_name(model, _OBJ.mjOBJ_JOINT, joint)}: expected one per joint; remove one"
             )
         driven.setdefault(joint, name)
+    if others:
+        yield (
+            f"{each('actuator', others)} does not drive one hinge joint: expected "
+            'joint="<hinge>"; replace tendon, site, body or free-joint transmissions'
+        )
 
 
 def check_feet(model: mujoco.MjModel) -> Iterator[str]:
-    """Feet. Asked of the completed model."""
-    if len(foot_ids(model)) == 0:
+    """Feet at the ends of legs. Asked of the completed model."""
+    feet = foot_ids(model)
+    fixed = [foot for foot in feet if model.body_weldid[model.geom_bodyid[foot]] == 1]
+    if fixed:
+        names = [_name(model, _OBJ.mjOBJ_GEOM, foot) for foot in fixed]
+        bodies = [_name(model, _OBJ.mjOBJ_BODY, b) for b in ends_without_foot(model, _home(model))]
+        also = f", and put it into those of bodies {listed(bodies)}" if bodies else ""
+        yield (
+            f"{each('geom', names)} is rigidly on the trunk "
+            f'{_name(model, _OBJ.mjOBJ_BODY, 1)}, but "foot" in a name says that it is a foot: '
+            "expected feet at the ends of legs that move; take the word out of these names" + also
+        )
+    if len(feet) == 0:
         yield (
             'no geom has "foot" in its name, and no leg ends in a geom that could be a foot: '
             "expected one sphere or box per foot; add them where the robot touches the floor, e.g. "
@@ -334,14 +382,47 @@ def check_feet(model: mujoco.MjModel) -> Iterator[str]:
         )
 
 
+def check_home(model: mujoco.MjModel) -> Iterator[str]:
+    """A trunk with z up, above the feet, in "home". Asked of the completed model."""
+    feet, trunk = foot_ids(model), _name(model, _OBJ.mjOBJ_BODY, 1)
+    if len(feet) == 0:
+        return
+    data = mujoco.MjData(model)
+    data.qpos[:] = _home(model)
+    mujoco.mj_kinematics(model, data)
+    height = data.xpos[1, 2] - min(lowest(model, data, foot) for foot in feet)
+    if tilt(data.qpos) > MAX_TILT:
+        yield (
+            f'the trunk {trunk} is tilted by {tilt(data.qpos):.0f} degrees in "home": expected its '
+            "frame with x forward and z up; turn the trunk frame until its z axis points up, or "
+            "correct the quaternion (numbers 4 to 7 of qpos)"
+        )
+    elif height <= 0.01 * standing_height(model, data):
+        side = "below" if height < 0 else "above"
+        yield (
+            f"the origin of the trunk {trunk} is {abs(height):.3f} m {side} the lowest foot in "
+            '"home": expected it well above, in the trunk; move the origin up, and all that is in '
+            "the trunk down by as much (in a URDF, make the link of the trunk the root)"
+        )
+
+
+def tilt(qpos) -> float:
+    """Angle between the z axis of the trunk and the vertical, degrees."""
+    _, x, y, _ = qpos[3:7] / np.linalg.norm(qpos[3:7])
+    return float(np.degrees(np.arccos(np.clip(1 - 2 * (x * x + y * y), -1, 1))))
+
+
 def check_spheres(model: mujoco.MjModel) -> Iterator[str]:
     """Geoms of group 5 are collision spheres."""
-    for geom in np.flatnonzero(model.geom_group == COLLISION_GROUP):
-        if model.geom_type[geom] != mujoco.mjtGeom.mjGEOM_SPHERE:
-            yield (
-                f"geom {_name(model, _OBJ.mjOBJ_GEOM, geom)} of group {COLLISION_GROUP} is not a "
-                "sphere: that group is kept for collision spheres; use another group"
-            )
+    other = (model.geom_group == COLLISION_GROUP) & (
+        model.geom_type != mujoco.mjtGeom.mjGEOM_SPHERE
+    )
+    names = [_name(model, _OBJ.mjOBJ_GEOM, geom) for geom in np.flatnonzero(other)]
+    if names:
+        yield (
+            f"{each('geom', names)} of group {COLLISION_GROUP} is not a sphere: "
+            "that group is kept for collision spheres; use another group"
+        )
 
 
 def check_custom(model: mujoco.MjModel) -> Iterator[str]:
@@ -382,6 +463,10 @@ CHECKS: tuple[Callable[[mujoco.MjModel], Iterator[str]], ...] = (
 
 def _name(model: mujoco.MjModel, kind: mujoco.mjtObj, index: int) -> str:
     return repr(mujoco.mj_id2name(model, kind, int(index)) or f"number {index}")
+
+
+def _home(model: mujoco.MjModel) -> np.ndarray:
+    return np.array(model.key_qpos[mujoco.mj_name2id(model, _OBJ.mjOBJ_KEY, "home")])
 
 
 def _shown(values: np.ndarray) -> str:
@@ -480,7 +565,7 @@ def _read(name: str, path: Path | None, xml: str, model: mujoco.MjModel, inferre
     joints = np.flatnonzero(model.jnt_type == _JOINT.mjJNT_HINGE)
     actuated = np.searchsorted(joints, model.actuator_trnid[:, 0])
     feet = foot_ids(model)
-    home = np.array(model.key_qpos[mujoco.mj_name2id(model, _OBJ.mjOBJ_KEY, "home")])
+    home = _home(model)
     keep = _numeric(model, "keep_nominal")
     legs = {2: "biped", 4: "quadruped", 6: "hexapod"}.get(len(feet), f"{len(feet)} feet")
     return Robot(

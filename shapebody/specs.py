@@ -6,7 +6,7 @@ import mujoco
 import numpy as np
 
 COLLISION_GROUP = 5
-FOOT = re.compile("foot", re.IGNORECASE)
+FOOT = re.compile("foot(?!print)", re.IGNORECASE)  # "base_footprint" is no foot
 
 _GEOM, _JOINT = mujoco.mjtGeom, mujoco.mjtJoint
 # Integers compare equal with what models hold and with what specs hold.
@@ -26,6 +26,15 @@ def listed(names) -> str:
     return ", ".join(shown[:6]) + more
 
 
+def each(kind: str, names) -> str:
+    """Singular subject of a message about elements: "body 'a'", "each of bodies 'a', 'b'"."""
+    names = list(names)
+    if len(names) == 1:
+        return f"{kind} {names[0]}"
+    plural = f"{kind[:-1]}ies" if kind.endswith("y") else f"{kind}s"
+    return f"each of {plural} {listed(names)}"
+
+
 def ordered(elements) -> list:
     """Elements of a compiled spec in the order of the model."""
     return sorted(elements, key=lambda element: element.id)
@@ -38,11 +47,17 @@ def name_parts(spec):
         if not joint.name and joint.type != _JOINT.mjJNT_FREE:
             joint.name = unused(f"joint_{index}", taken)
             taken.add(joint.name)
+    taken = {geom.name for geom in spec.geoms}
     spheres = [geom for geom in spec.geoms if geom.group == COLLISION_GROUP]
     for index, geom in enumerate(spheres):
-        geom.name = geom.name or f"sphere_{index}"
+        if not geom.name:
+            geom.name = unused(f"sphere_{index}", taken)
+            taken.add(geom.name)
+    taken = {actuator.name for actuator in spec.actuators}
     for actuator in spec.actuators:
-        actuator.name = actuator.name or actuator.target
+        if not actuator.name:
+            actuator.name = unused(actuator.target, taken)
+            taken.add(actuator.name)
 
 
 def write_inertial(body, model):

@@ -399,12 +399,193 @@ def test_biped_urdf(tmp_path):
     for text in (
         "the file is a URDF",
         "3 meshes are not found",
-        "'base_link' gets a free joint",
-        "links torso, imu_link, left_foot, right_foot are fixed",
+        "links base_link above 'torso' have no mass, no geometry",
+        "'torso' gets a free joint",
+        "links imu_link, left_foot, right_foot are fixed",
         "torque limits of the joints (actuatorfrcrange, effort)",
         "joints shoulder carry no foot",
     ):
         assert noted(robot, text), text
+
+
+def edited_urdf(folder, *changes, **kind):
+    """The biped with changes of its text."""
+    path = biped_urdf(folder, **kind)
+    text = path.read_text()
+    for old, new in changes:
+        assert old in text
+        text = text.replace(old, new)
+    path.write_text(text)
+    return path
+
+
+BASE = '<link name="base_link"/>'
+TORSO_FIXED = FIXED.format(parent="base_link", child="torso", xyz="0 0 0")
+
+
+def test_urdf_frames_above_the_base_are_dropped(tmp_path):
+    above = FIXED.format(parent="base_footprint", child="base_link", xyz="0 0 0.8")
+    path = edited_urdf(tmp_path, (BASE, f'<link name="base_footprint"/>{BASE}{above}'))
+    robot = load_robot(path)
+    assert noted(robot, "links base_footprint, base_link above 'torso' have no mass")
+    assert robot.model.body(robot.trunk).name == "torso"
+    assert robot.home[2] == pytest.approx(0.8, abs=0.05)
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        # Geometry, a second child, and a turned child: the root says something.
+        (BASE, f'<link name="base_link">{SOLE}</link>'),
+        ('"torso"/><child link="imu_link"', '"base_link"/><child link="imu_link"'),
+        (TORSO_FIXED, TORSO_FIXED.replace("<origin", '<origin rpy="0.1 0 0"')),
+    ],
+)
+def test_other_urdf_roots_stay_the_base(tmp_path, change):
+    robot = load_robot(edited_urdf(tmp_path, change))
+    assert robot.model.body(robot.trunk).name == "base_link"
+    assert not noted(robot, "have no mass, no geometry")
+
+
+HIP = 'name="left_hip" type="revolute"'
+BAD_URDF = {
+    "repeated joint": (
+        [('name="right_hip"', 'name="left_hip"')],
+        "not a valid URDF file: repeated name 'left_hip' in joint .2 of them.*rename one",
+    ),
+    "repeated link": (
+        [('<link name="imu_link"/>', '<link name="imu_link"/><link name="arm"/>')],
+        "not a valid URDF file: repeated name 'arm' in link .2 of them.*rename one",
+    ),
+    "empty velocity": (
+        [('velocity="12"', 'velocity=""')],
+        "velocity of joints 'shoulder', 'left_hip', .* is '': expected a number",
+    ),
+    "velocity of a template": (
+        [(HIP, f'{HIP}><limit velocity="${{fast}}"/></joint><joint name="x" type="fixed"')],
+        r"velocity of joint 'left_hip' is '\${fast}': expected a number .rad/s.*xacro",
+    ),
+    "floating joint below a link": (
+        [(HIP, 'name="left_hip" type="floating"')],
+        "free joint can only be used on top level.*remove the link above the floating joint",
+    ),
+    "two floating bases": (
+        [
+            (BASE, f'<link name="world"/>{BASE}'),
+            (
+                TORSO_FIXED,
+                FIXED.format(parent="world", child="base_link", xyz="0 0 0")
+                + TORSO_FIXED.replace('parent link="base_link"', 'parent link="world"').replace(
+                    "fixed", "floating"
+                ),
+            ),
+            ('type="revolute">\n    <parent link="torso"/><child link="arm"/>', "FLOATING"),
+            ("FLOATING", 'type="floating"><parent link="world"/><child link="arm"/>'),
+        ],
+        "2 free joints .bodies 'torso', 'arm'.: expected exactly one",
+    ),
+    "no limits": (
+        [('type="revolute"', 'type="continuous"'), ("lower=", "low="), ("upper=", "high=")],
+        "joints 'shoulder', 'left_hip', 'left_knee', .*'right_knee' has no limits: expected",
+    ),
+    "mimic joint": (
+        [('<child link="left_thigh"/>', '<child link="left_thigh"/><mimic joint="shoulder"/>')],
+        "type joint .*'left_hip' with 'shoulder'.*expected none",
+    ),
+}
+
+
+@pytest.mark.parametrize("case", BAD_URDF)
+def test_urdf_that_does_not_fit(tmp_path, case):
+    changes, message = BAD_URDF[case]
+    with pytest.raises(ValueError, match=message):
+        load_robot(edited_urdf(tmp_path, *changes))
+
+
+def test_all_problems_of_a_urdf_text_are_named(tmp_path):
+    changes = ('name="right_hip"', 'name="left_hip"'), ('velocity="12"', 'velocity="fast"')
+    with pytest.raises(ValueError, match="repeated name 'left_hip'.*velocity of joints .*'fast'"):
+        load_robot(edited_urdf(tmp_path, *changes))
+
+
+def test_files_by_any_name(tmp_path, monkeypatch):
+    text = biped_urdf(tmp_path).read_text()
+    (tmp_path / "WALKER.URDF").write_text(text)
+    (tmp_path / "walker").write_text(text)
+    (tmp_path / "dog.mjcf").write_text(quadruped(tmp_path).read_text())
+    (tmp_path / "unitree_go2").write_text("not this one")
+    monkeypatch.chdir(tmp_path)
+    for name in ("WALKER.URDF", "./walker", "walker"):
+        assert load_robot(name).num_feet == 2
+    dog = load_robot("dog.mjcf")
+    assert dog.num_feet == 4 and not noted(dog, "cannot be read")
+    assert load_robot("unitree_go2").inferred == ()
+    with pytest.raises(FileNotFoundError, match="./wlaker.*does not exist"):
+        load_robot("./wlaker")
+
+
+FLOOR = '<geom name="{}" type="plane" size="0 0 1" {}/>'
+
+
+@pytest.mark.parametrize(
+    "name, pose, note",
+    [
+        ("floor", 'pos="0 0 -0.5"', '"floor" is at z = -0.5 m and tilted by 0 degrees'),
+        ("floor", 'euler="0.35 0 0"', '"floor" is at z = 0 m and tilted by 20.1 degrees'),
+        ("ground", 'pos="0 0 1" euler="0.35 0 0"', "plane 'ground' is the floor"),
+        ("floor", 'pos="1 2 0" euler="0 0 1"', None),
+    ],
+)
+def test_the_floor_is_level_at_zero(tmp_path, name, pose, note):
+    change = "<worldbody>", "<worldbody>" + FLOOR.format(name, pose)
+    robot = load_robot(quadruped(tmp_path, changes=[change]))
+    floor = robot.model.geom("floor")
+    assert floor.pos[2] == 0
+    np.testing.assert_allclose(floor.quat[1:3], 0, atol=1e-12)
+    assert noted(robot, note or '"floor"') == (note is not None)
+
+
+def test_trunk_with_its_origin_at_the_feet_or_below(tmp_path):
+    # The parts of the trunk are where they were, its origin is not.
+    for lower in (0.4, 0.5):
+        changes = [
+            (f'_hip" pos="{x} {y} 0"', f'_hip" pos="{x} {y} {lower}"') for _, x, y, _ in LEGS
+        ]
+        with pytest.raises(ValueError, match="origin of the trunk 'base' is .*expected it well ab"):
+            load_robot(quadruped(tmp_path, changes=changes))
+
+
+def test_head_above_the_trunk(tmp_path):
+    head = (
+        '<body name="head" pos="0.2 0 0.2"><inertial pos="0 0 0" mass="0.1" diaginertia="1e-4 1e-4'
+        ' 1e-4"/><joint name="neck" range="-1 1"/><geom size="0.05"/><geom size="0.04"/></body>'
+    )
+    site = '<site name="imu" pos="0.01 0 0"/>'
+    robot = load_robot(quadruped(tmp_path, changes=[(site, site + head)]))
+    assert robot.num_feet == 4
+
+
+def test_unnamed_parts_get_names_that_are_free(tmp_path):
+    sphere = '<geom {} class="collision" type="sphere" size="0.03" group="5"/>'
+    site = '<site name="imu" pos="0.01 0 0"/>'
+    spheres = sphere.format('name="sphere_1"') + sphere.format("")
+    robot = load_robot(quadruped(tmp_path, changes=[(site, site + spheres)]))
+    names = [robot.model.geom(int(i)).name for i in robot.spheres]
+    assert len(set(names)) == 2 and "sphere_1" in names
+    motor = '<motor class="hip" name="FL_thigh" joint="FL_thigh_joint"/>'
+    twice = '<motor joint="FL_thigh_joint"/>' * 2
+    with pytest.raises(ValueError, match="'FL_thigh_joint' and 'FL_thigh_joint_2' drive the same"):
+        load_robot(quadruped(tmp_path, changes=[(motor, twice)]))
+
+
+def test_a_footprint_is_no_foot(tmp_path):
+    box = '<geom class="collision" type="box" size="0.18 0.05 0.06"/>'
+    named = box.replace("<geom", '<geom name="base_footprint"')
+    robot = load_robot(quadruped(tmp_path, changes=[(box, named)]))
+    assert {robot.model.geom(int(i)).name for i in robot.feet} == {f"{leg[0]}_foot" for leg in LEGS}
+    changes = [(box, box.replace("<geom", '<geom name="foot_guard"'))]
+    with pytest.raises(ValueError, match="'foot_guard' is rigidly on the trunk 'base'.*'FL_calf'"):
+        load_robot(quadruped(tmp_path, changes=changes))
 
 
 def test_foot_links_without_geometry_become_spheres(tmp_path):

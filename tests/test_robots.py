@@ -422,6 +422,34 @@ BAD = {
         [(RIGHT_HIP, RIGHT_HIP.replace('range="-1 1"', ""))],
         "'right_hip' has no limits: expected range",
     ),
+    "limits of all joints": (
+        [('range="-1 1"', "")],
+        "each of joints 'left_hip', 'right_hip' has no limits: expected range",
+    ),
+    "exchanged limits": (
+        [(RIGHT_HIP, RIGHT_HIP.replace("-1 1", "1 -1"))],
+        "joint 'right_hip' has range=\"1 -1\", which is no limit: expected lower < upper",
+    ),
+    "limits that do not hold": (
+        [(RIGHT_HIP, RIGHT_HIP.replace("range", 'limited="false" range'))],
+        'joint \'right_hip\' has range="-1 1".*no limited="false"',
+    ),
+    "axis of no length": (
+        [('axis="0 1 0"', 'axis="0 0 0"')],
+        "axis too small .*left_hip.*Correct the reported element",
+    ),
+    "upside down": (
+        [(KEY, KEY.replace("1 0 0 0", "0 1 0 0"))],
+        "trunk 'trunk' is tilted by 180 degrees in \"home\": expected .*z up",
+    ),
+    "trunk pitched": (
+        [(KEY, ""), ('<body name="trunk"', '<body name="trunk" quat="1 0 1 0"')],
+        "trunk 'trunk' is tilted by 90 degrees in \"home\": expected .*z up; turn the trunk frame",
+    ),
+    "foot on the trunk": (
+        [('<geom type="box"', '<geom name="foot_rest" type="box"')],
+        "geom 'foot_rest' is rigidly on the trunk 'trunk'.*take the word out of these names",
+    ),
     "nothing to drive": (
         [
             (ACTUATORS, ""),
@@ -433,7 +461,7 @@ BAD = {
     ),
     "massless body": (
         [('mass="0.3" diaginertia="0.001 0.001 0.0002"', 'mass="0" diaginertia="0 0 0"')],
-        "'left' has mass and inertia 0 kg and 0 kg m²(?s:.*)'right' has mass",
+        "each of bodies 'left', 'right' has mass and inertia 0 kg and 0 kg m²: expected at least",
     ),
     "closed loop": (
         [
@@ -490,6 +518,17 @@ def test_file_that_does_not_fit(tmp_path, case):
     with pytest.raises(ValueError, match=message) as error:
         load_robot(path)
     assert str(path) in str(error.value)
+
+
+def test_files_of_another_kind(tmp_path):
+    path = tmp_path / "page.xml"
+    path.write_text("<html><body>404</body></html>")
+    with pytest.raises(ValueError, match="model type: 'html'.*another kind of file") as error:
+        load_robot(path)
+    assert "cut off" not in str(error.value)
+    path.write_text(OWN[:300])
+    with pytest.raises(ValueError, match="complete XML file; it may be cut off"):
+        load_robot(path)
 
 
 def test_all_problems_are_listed_at_once(tmp_path):
