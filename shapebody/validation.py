@@ -10,10 +10,12 @@ from pathlib import Path
 import mujoco
 import numpy as np
 
+from shapebody.feet import ends_without_foot
 from shapebody.inference import FLOOR_TOLERANCE, leg_torque
-from shapebody.robots import Robot, examine, find
+from shapebody.robots import Robot, examine, find, tilt
 from shapebody.specs import listed
 
+TILT = 15.0  # degrees of the trunk in "home" above which something is probably wrong
 RANGE_CHANGE = 0.8  # rad: in a design both limits of a joint can move towards each other by half
 
 
@@ -99,10 +101,19 @@ def validate_robot(name_or_path: str | Path) -> Report:
     """
     path = Path(name_or_path)
     try:
-        path = find(name_or_path)
-        robot, problems, inferred = examine(path)
+        return _report(find(name_or_path))
     except (ValueError, OSError) as error:
-        return Report(path, None, (str(error),), (), ())
+        problem = str(error)
+    except Exception as error:  # a report, whatever the file holds
+        problem = (
+            f"{path} cannot be judged, which is a fault of shapebody and not of the file: "
+            f"{type(error).__name__}: {error}; please report it with the file"
+        )
+    return Report(path, None, (problem,), (), ())
+
+
+def _report(path: Path) -> Report:
+    robot, problems, inferred = examine(path)
     if robot is None:
         return Report(path, None, tuple(problems), inferred, ())
     held = hold(robot)
@@ -117,7 +128,7 @@ class Held:
     finite: bool
     """False if the simulation failed."""
     sunk: float
-    """How far the trunk sank, as a share of its height."""
+    """How far the trunk sank, as a share of its height; above 1 if it fell through the floor."""
     tilt: float
     """Largest angle of the trunk from its home orientation, rad."""
     touching: np.ndarray
@@ -132,9 +143,9 @@ def hold(robot: Robot, seconds: float = 1.0) -> Held:
     data.qpos[:] = robot.home
     data.ctrl[:] = robot.nominal
     mujoco.mj_forward(model, data)
-    height = data.xpos[robot.trunk, 2]
+    height = max(data.xpos[robot.trunk, 2], 1e-3)
     up = data.xmat[robot.trunk].reshape(3, 3)[2].copy()
-    lowest, tilt = height, 0.0
+    lowest, angle = height, 0.0
     touching = np.zeros(robot.num_feet, bool)
     saturated = np.zeros(robot.num_actuators)
     limits = model.actuator_forcerange[:, 1]
@@ -147,11 +158,11 @@ def hold(robot: Robot, seconds: float = 1.0) -> Held:
             break
         lowest = min(lowest, data.xpos[robot.trunk, 2])
         cosine = data.xmat[robot.trunk].reshape(3, 3)[2] @ up
-        tilt = max(tilt, float(np.arccos(np.clip(cosine, -1, 1))))
+        angle = max(angle, float(np.arccos(np.clip(cosine, -1, 1))))
         geoms = data.contact.geom[: data.ncon].ravel()
         touching |= np.isin(robot.feet, geoms)
         saturated += np.abs(data.actuator_force) >= 0.999 * limits
-    return Held(finite, float(1 - lowest / height), tilt, touching, saturated / steps)
+    return Held(finite, float(1 - lowest / height), angle, touching, saturated / steps)
 
 
 # Warnings. Each takes the robot and `Held` and yields one message per finding.
@@ -166,15 +177,54 @@ def warn_standing(robot: Robot, held: Held) -> Iterator[str]:
             "them, or add armature to the joints"
         )
     elif held.tilt > np.radians(30) or held.sunk > 0.35:
+        if held.sunk > 1:
+            cause = (
+                "Only its feet touch the floor, so it fell over and the trunk went through: see "
+                'that "home", the feet, kp and the torque limits are as meant'
+            )
+        else:
+            cause = (
+                "With gains as soft as the paper's that is usual (many of its robots do, the Go2 "
+                'among them) and the policy learns to hold it; but see that "home", kp and the '
+                "torque limits are as meant"
+            )
         yield (
             f"it falls out of its nominal pose: within 1 s the trunk sinks by {held.sunk:.0%} of "
-            f"its height and tilts by {np.degrees(held.tilt):.0f} degrees. With gains as soft as "
-            "the paper's that is usual (many of its robots do, the Go2 among them) and the policy "
-            'learns to hold it; but see that "home", kp and the torque limits are as meant'
+            f"its height and tilts by {np.degrees(held.tilt):.0f} degrees. {cause}"
         )
     if held.finite and not held.touching.all():
         feet = listed(robot.model.geom(int(i)).name for i in robot.feet[~held.touching])
         yield f'feet {feet} do not touch the floor in the nominal pose: correct "home" or the feet'
+
+
+def warn_feet(robot: Robot, held: Held) -> Iterator[str]:
+    """Are all feet found, and does every joint of a leg have a motor?"""
+    model = robot.model
+    ends = ends_without_foot(model, robot.home)
+    if ends:
+        bodies = listed(model.body(body).name for body in ends)
+        geoms = listed(model.geom(group[0]).name for group in ends.values())
+        yield (
+            f"bodies {bodies} reach the floor like legs but have no foot, and only feet touch the "
+            f'floor: if these are legs, put "foot" into the names of their lowest geoms ({geoms})'
+        )
+    if robot.num_feet < 2:
+        yield (
+            f"{robot.num_feet} foot ({model.geom(int(robot.feet[0])).name}): expected two or more; "
+            'put "foot" into the name of every geom that touches the floor'
+        )
+    carrying = set()
+    for body in robot.foot_bodies:
+        while body > 0:
+            carrying.add(int(body))
+            body = model.body_parentid[body]
+    free = np.setdiff1d(robot.joints, robot.joints[robot.actuated])
+    free = [model.joint(int(j)).name for j in free if int(model.jnt_bodyid[j]) in carrying]
+    if free:
+        yield (
+            f"joints {listed(free)} carry a foot but no actuator drives them: they swing freely; "
+            "give each a <position>, or remove the <actuator> section to get one for every joint"
+        )
 
 
 def warn_torque(robot: Robot, held: Held) -> Iterator[str]:
@@ -190,11 +240,12 @@ def warn_torque(robot: Robot, held: Held) -> Iterator[str]:
         needed += jacobian.T @ weight
     needed = np.abs(needed[robot.qvel_index])
     limits = model.actuator_forcerange[:, 1]
-    for i in np.flatnonzero(needed > limits):
-        yield (
-            f"actuator {model.actuator(int(i)).name!r} is too weak to stand: about {needed[i]:.3g} "
-            f"N m with the weight on all feet, limit {limits[i]:.3g} N m"
-        )
+    weak = [
+        f"{model.actuator(int(i)).name} (limit {limits[i]:.3g} N m, needs about {needed[i]:.3g})"
+        for i in np.flatnonzero(needed > limits)
+    ]
+    if weak:
+        yield f"too weak to stand with the weight on all feet: {listed(weak)}"
     usual = leg_torque(model)
     high = np.flatnonzero(limits > 20 * usual)
     if len(high):
@@ -232,8 +283,14 @@ def warn_limits(robot: Robot, held: Held) -> Iterator[str]:
 
 
 def warn_plausibility(robot: Robot, held: Held) -> Iterator[str]:
-    """Sizes, gravity, damping, self-collision."""
+    """Pose of the trunk, sizes, gravity, damping, self-collision."""
     model = robot.model
+    if tilt(robot.home) > TILT:
+        yield (
+            f'the trunk is tilted by {tilt(robot.home):.0f} degrees in "home": expected its frame '
+            "with x forward and z up; turn the trunk frame until its z axis points up, or correct "
+            "the quaternion (numbers 4 to 7 of qpos)"
+        )
     mass, height = model.body_mass[1:].sum(), robot.home[2]
     if not 0.1 < mass < 300 or not 0.03 < height < 3:
         yield f"{mass:.3g} kg and a trunk {height:.3g} m high: are the units kg and m?"
@@ -260,7 +317,7 @@ def _gap(robot: Robot) -> float:
     return float(robot.home[2] - standing_pose(robot, robot.model, robot.nominal)[2])
 
 
-WARNINGS = (warn_standing, warn_torque, warn_limits, warn_plausibility)
+WARNINGS = (warn_standing, warn_feet, warn_torque, warn_limits, warn_plausibility)
 
 
 def _summary(robot: Robot, held: Held) -> dict[str, str]:

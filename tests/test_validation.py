@@ -5,7 +5,7 @@ import time
 import numpy as np
 import pytest
 from test_inference import biped_urdf, quadruped
-from test_robots import BAD, OWN, own_robot
+from test_robots import BAD, OWN, RIGHT_ACTUATOR, own_robot
 
 import shapebody as sb
 from shapebody.__main__ import main
@@ -101,7 +101,7 @@ def test_warnings(tmp_path):
     fine = validate_robot(path)
     assert fine.ok and fine.inferred == ()
     for change, message in (
-        ((LIMITS, LIMITS.replace("9", "0.01")), "is too weak to stand: about"),
+        ((LIMITS, LIMITS.replace("9", "0.01")), "weight on all feet: right_hip (limit 0.01 N m"),
         ((LIMITS, LIMITS.replace("9", "9000")), "a placeholder? Correct forcerange"),
         ((LIMITS, LIMITS.replace("0.5", "0")), "the D gain (kv) is 0"),
         ((LIMITS, LIMITS.replace("20", "2e6").replace("9", "1e5")), "becomes unstable within 1 s"),
@@ -111,9 +111,43 @@ def test_warnings(tmp_path):
         (('mass="2"', 'mass="2000"'), "are the units kg and m?"),
         (("<option ", '<option gravity="0 -9.81 0" '), "gravity is"),
         (('size="0.08" group="5"', 'size="0.08" group="4"'), "no collision spheres"),
+        (("0.3 1 0 0 0", "0.3 0.97 0 0.24 0"), "the trunk is tilted by 28 degrees"),
+        (('name="left_foot"', 'name="left_tip"'), "no foot, and only feet touch"),
+        (('name="left_foot"', 'name="left_tip"'), "(left_tip)"),
+        (('name="left_foot"', 'name="left_tip"'), "1 foot (right_foot): expected two or more"),
     ):
         assert not any(message in warning for warning in fine.warnings)
         assert warned(own_robot(tmp_path, change), message), message
+
+
+def test_equal_findings_are_one_warning(tmp_path):
+    weak = validate_robot(own_robot(tmp_path, (LIMITS, LIMITS.replace("9", "0.01"))))
+    (message,) = [warning for warning in weak.warnings if "too weak" in warning]
+    assert "right_hip" in message and "left_hip" in message
+
+
+def test_legs_without_motors(tmp_path):
+    text = own_robot(tmp_path, (f"    {RIGHT_ACTUATOR}\n", ""), ("10 11", "10")).read_text()
+    path = tmp_path / "half.xml"
+    path.write_text(text)
+    assert warned(path, "joints right_hip carry a foot but no actuator drives them")
+
+
+def test_a_trunk_that_falls_through_the_floor_is_not_usual(tmp_path):
+    report = validate_robot("talos")
+    (fall,) = [warning for warning in report.warnings if "falls out of" in warning]
+    assert "sinks by 1" in fall and "usual" not in fall and "went through" in fall
+    (fall,) = [w for w in validate_robot("unitree_go2").warnings if "falls out of" in w]
+    assert "usual" in fall
+
+
+def test_faults_of_the_package_are_reported_too(tmp_path, monkeypatch):
+    def fails(path):
+        raise IndexError("list index out of range")
+
+    monkeypatch.setattr("shapebody.validation.examine", fails)
+    (problem,) = validate_robot(own_robot(tmp_path)).problems
+    assert "a fault of shapebody" in problem and "IndexError: list index" in problem
 
 
 def test_holding_the_nominal_pose(tmp_path):
