@@ -127,9 +127,10 @@ class TrainConfig:
                 "policy": PolicyConfig.reduced(),
                 "critic": CriticConfig.reduced(),
                 "standardize": True,
-                # Short rollouts of many environments: more bodies in a batch of the same size.
-                "num_envs": 1024,
-                "rollout_length": 8,
+                # More environments would bring more bodies into a batch, but fewer episodes to
+                # each, and c moves by episodes.
+                "num_envs": 256,
+                "rollout_length": 32,
                 "minibatch_size": 2048,
                 "epochs": 3,
                 "total_steps": 50_000_000,
