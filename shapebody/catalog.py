@@ -11,8 +11,6 @@ from shapebody.mjcf import standing_pose
 from shapebody.physics.native import NativePhysics
 from shapebody.robots import Robot, load_robot, robots
 
-MORPHOLOGIES = ("quadruped", "biped", "humanoid", "hexapod")
-
 TOPPLED_TILT = 60.0
 """Degrees from upright beyond which a body counts as toppled."""
 TOPPLED_HEIGHT = 0.5
