@@ -15,12 +15,13 @@ import numpy as np
 from shapebody.checkpoints import Agent
 from shapebody.design import DesignSpace
 from shapebody.locomotion import Locomotion, TaskConfig
+from shapebody.locomotion.env import RESET_SLOTS
 from shapebody.networks import Policy, PolicyConfig
 from shapebody.robots import Robot
 
 CONFIDENCE = 0.95
 RESAMPLES = 10_000
-_CALLS = 50  # control steps per call of an engine that runs whole rollouts
+_CALLS = 50  # control steps between reports, and per call of an engine that runs whole rollouts
 
 
 @dataclass(frozen=True)
@@ -156,21 +157,14 @@ def evaluate(
     size = -(-total // chunks)
     env = _environment(robot, size, engine, config.task, config.recompute_constants)
     keys = np.asarray(_episode_keys(seed, config.episodes))
-    measured = []
+    work = _Work(rows, keys, config, progress)
     began = time.perf_counter()
-    for chunk in range(chunks):
-        # The last chunk is filled up with its own last episode.
-        index = np.minimum(np.arange(chunk * size, (chunk + 1) * size), total - 1)
-        design, episode = np.divmod(index, config.episodes)
-        report = functools.partial(_report, chunk, chunks) if progress else None
-        measured.append(_run(env, agent, rows[design], keys[episode], config.coefficient, report))
+    results = _queued(env, agent, work) if env.engine == "native" else _chunked(env, agent, work)
     if progress:
         print(flush=True)
     seconds = time.perf_counter() - began
     shape = designs.shape[:-1] + (config.episodes,)
-    results = _Episodes(
-        *(np.concatenate(parts)[:total].reshape(shape) for parts in zip(*measured, strict=True))
-    )
+    results = _Episodes(*(x.reshape(shape) for x in results))
     return Evaluation(
         **results._asdict(),
         seconds=seconds,
@@ -194,48 +188,107 @@ class _Episodes(NamedTuple):
     finite: np.ndarray
 
 
-def _report(chunk: int, chunks: int, share: float):
-    print(f"\revaluated {(chunk + share) / chunks:4.0%}", end="", flush=True)
+@dataclass(frozen=True)
+class _Work:
+    """All episodes of an evaluation; number n is episode n % E of design n // E."""
+
+    designs: np.ndarray  # [S, d]
+    keys: np.ndarray  # [E, ...]
+    config: EvaluationConfig
+    progress: bool
+
+    @property
+    def total(self) -> int:
+        return len(self.designs) * len(self.keys)
+
+    def begin(self, env: Locomotion, numbers):
+        """Start these episodes in all environments."""
+        designs, keys = self.of(numbers)
+        key = jax.random.PRNGKey(0)  # the episodes have their own
+        return env.reset(key, designs, self.config.coefficient, keys=jnp.asarray(keys))
+
+    def of(self, numbers):
+        """Designs [n, d] and keys [n, ...] of episodes."""
+        design, episode = np.divmod(numbers, len(self.keys))
+        return self.designs[design], self.keys[episode]
+
+    def empty(self) -> _Episodes:
+        return _Episodes(
+            returns=np.zeros(self.total, np.float32),
+            tracking_error=np.zeros(self.total, np.float32),
+            lengths=np.zeros(self.total, np.int32),
+            finite=np.ones(self.total, bool),
+        )
+
+    def report(self, done: float):
+        if self.progress:
+            print(f"\revaluated {done / self.total:4.0%}", end="", flush=True)
 
 
-def _run(env: Locomotion, agent: Agent, designs, keys, coefficient, report) -> _Episodes:
-    """One episode in every environment."""
-    n = env.num_envs
-    policy = _policy(agent.policy_config)
-    state = env.reset(
-        jax.random.PRNGKey(0), designs, coefficient=coefficient, keys=jnp.asarray(keys)
-    )
-    params = _embed(agent.policy_config)(agent.policy, state.descriptions)
-    result = _Episodes(
-        returns=np.zeros(n, np.float32),
-        tracking_error=np.zeros(n, np.float32),
-        lengths=np.zeros(n, np.int32),
-        finite=np.ones(n, bool),
-    )
-    running = np.ones(n, bool)
+def _queued(env: Locomotion, agent: Agent, work: _Work) -> _Episodes:
+    """Native engine: an environment whose episode has ended takes the next one."""
+    policy, embed = _policy(agent.policy_config), _embed(agent.policy_config)
+    results = work.empty()
+    number = np.arange(env.num_envs)  # the episode in each environment
+    following = env.num_envs
+    state = work.begin(env, number)
+    params = embed(agent.policy, state.descriptions)
     key = jax.random.PRNGKey(0)  # mean actions need no random numbers
-    horizon = env.config.horizon
+    running = np.ones(env.num_envs, bool)
     step = 0
     while running.any():
-        if env.engine == "native":
-            state, record, _ = env.step(policy, params, state, key)
-            records = [record]
-        else:
-            length = min(_CALLS, horizon)
+        state, record, _ = env.step(policy, params, state, key)
+        ended = running & (record.terminated | record.truncated)
+        _store(results, number[ended], record, ended)
+        running &= ~ended
+        left = work.total - following
+        idle = np.flatnonzero(~running)[:left]
+        # Starting an episode is compiled for several at once, so some wait for each other.
+        if left and len(idle) >= min(RESET_SLOTS, left, env.num_envs):
+            number[idle] = np.arange(following, following + len(idle))
+            following += len(idle)
+            designs, keys = work.of(number[idle])
+            state = env.restart(state, idle, keys, designs, work.config.coefficient)
+            params = embed(agent.policy, state.descriptions)
+            running[idle] = True
+        step += 1
+        if step % _CALLS == 0 or not running.any():
+            # An episode under way counts by the share of the horizon that is behind it.
+            part = np.sum(record.episode_length[running]) / env.config.horizon
+            work.report(following - running.sum() + part)
+    return results
+
+
+def _chunked(env: Locomotion, agent: Agent, work: _Work) -> _Episodes:
+    """MJX: one episode in every environment, until all have ended; then the next ones."""
+    policy, embed = _policy(agent.policy_config), _embed(agent.policy_config)
+    results = work.empty()
+    key = jax.random.PRNGKey(0)
+    length = min(_CALLS, env.config.horizon)
+    for first in range(0, work.total, env.num_envs):
+        # The last chunk is filled up with its own last episode.
+        number = np.minimum(np.arange(first, first + env.num_envs), work.total - 1)
+        state = work.begin(env, number)
+        params = embed(agent.policy, state.descriptions)
+        running = np.ones(env.num_envs, bool)
+        step = 0
+        while running.any():
             state, trajectory = env.rollout(policy, params, state, key, length)
-            records = _rows(trajectory, length)
-        for record in records:
-            ended = running & (record.terminated | record.truncated)
-            if ended.any():
-                result.returns[ended] = record.episode_return[ended]
-                result.tracking_error[ended] = record.episode_error[ended]
-                result.lengths[ended] = record.episode_length[ended]
-                result.finite[ended] = record.finite[ended]
+            for record in _rows(trajectory, length):
+                ended = running & (record.terminated | record.truncated)
+                _store(results, number[ended], record, ended)
                 running &= ~ended
-            step += 1
-        if report is not None and (step % _CALLS == 0 or not running.any()):
-            report(step / horizon if running.any() else 1.0)
-    return result
+            step += length
+            share = step / env.config.horizon if running.any() else 1.0
+            work.report(min(first + share * env.num_envs, work.total))
+    return results
+
+
+def _store(results: _Episodes, numbers, record, ended) -> None:
+    results.returns[numbers] = record.episode_return[ended]
+    results.tracking_error[numbers] = record.episode_error[ended]
+    results.lengths[numbers] = record.episode_length[ended]
+    results.finite[numbers] = record.finite[ended]
 
 
 class _Row(NamedTuple):

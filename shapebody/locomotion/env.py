@@ -337,18 +337,34 @@ class Locomotion:
             states.append(state)
         return states
 
-    def _restart(self, state: Episode, done: np.ndarray, following) -> Episode:
-        """Native engine: new episodes for the finished environments."""
-        coefficient, streak, keys = (np.asarray(x) for x in following)
+    def restart(
+        self, state: Episode, rows, keys: jax.Array, designs=None, coefficient=1.0, streak=0
+    ) -> Episode:
+        """Native engine: start new episodes in some environments, while the others go on.
+
+        Args:
+            state: from `reset`, `step` or `rollout`.
+            rows: [R] numbers of the environments, ascending.
+            keys: [R] one key per new episode.
+            designs: [R, d], padded to the largest robot's d; None draws them from U(-c, c).
+            coefficient: c of the new episodes, one number or [R]; `streak` likewise.
+
+        Returns:
+            The new state.
+        """
+        rows, keys = np.asarray(rows), np.asarray(keys)
+        coefficient = np.broadcast_to(np.asarray(coefficient, np.float32), rows.shape)
+        streak = np.broadcast_to(np.asarray(streak, np.int32), rows.shape)
         for group in self.groups:
-            ids = np.flatnonzero(done[group.slice])
-            if not len(ids):
+            own = (rows >= group.first) & (rows < group.first + group.count)
+            if not own.any():
                 continue
-            rows = ids + group.first
-            fresh = self._begin(group, ids, keys[rows], None, coefficient[rows], streak[rows])
+            f = None if designs is None else np.asarray(designs)[own, : group.space.dim]
+            ids = rows[own] - group.first
+            fresh = self._begin(group, ids, keys[own], f, coefficient[own], streak[own])
             fresh = jax.tree.map(lambda *x: np.concatenate(x), *fresh)
             state = jax.tree.map(
-                lambda old, new, rows=rows: _replaced(old, rows, new), state, fresh
+                lambda old, new, at=rows[own]: _replaced(old, at, new), state, fresh
             )
         return state
 
@@ -397,7 +413,9 @@ class Locomotion:
         record = jax.tree.map(np.asarray, record)
         done = record.terminated | record.truncated
         if self.auto_reset and done.any():
-            state = self._restart(state, done, following)
+            rows = np.flatnonzero(done)
+            coefficient, streak, keys = (np.asarray(x)[rows] for x in following)
+            state = self.restart(state, rows, keys, None, coefficient, streak)
         return state, record, outcome
 
     def _compiled(self, policy: Policy):
