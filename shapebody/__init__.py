@@ -45,7 +45,7 @@ _MODULE_OF = {
 }
 
 # Modules that notebooks use as such: shapebody.video.show_video(...).
-_MODULES = ("experiments", "explorer", "plots", "video")
+_MODULES = ("experiments", "explorer", "plots", "studies", "video")
 
 __all__ = sorted([*_MODULE_OF, *_MODULES])
 

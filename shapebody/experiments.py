@@ -18,7 +18,11 @@ class Budget:
     starts: int
     """Start designs of a design experiment."""
     episodes: int
-    """Evaluation episodes per design."""
+    """Evaluation episodes per design, where a notebook evaluates some."""
+    study_episodes: int
+    """Evaluation episodes per design of the stored design studies (`studies`)."""
+    search_iterations: int | None
+    """Iterations of their searches; None for the paper's."""
     random_designs: int
     """Designs over which value and return are compared."""
     random_episodes: int
@@ -34,9 +38,9 @@ class Budget:
 
 
 BUDGETS = {
-    "smoke": Budget(2, 2, 4, 2, 512, 0.4, 2, 100),
-    "reduced": Budget(10, 50, 256, 8, 400_000, 6.0, 12, 1000),
-    "full": Budget(10, 200, 256, 32, 20_000_000, 10.0, 12, 1000),
+    "smoke": Budget(2, 2, 2, 2, 4, 2, 512, 0.4, 2, 100),
+    "reduced": Budget(10, 50, 200, None, 256, 8, 400_000, 6.0, 12, 1000),
+    "full": Budget(10, 200, 200, None, 256, 32, 20_000_000, 10.0, 12, 1000),
 }
 """The table of scales. The method is the same at all of them."""
 
@@ -52,6 +56,23 @@ def scale() -> str:
 def budget() -> Budget:
     """The budget of the scale in force."""
     return BUDGETS[scale()]
+
+
+def study_setting() -> dict:
+    """What `studies.design_study` takes from the budget of the scale in force."""
+    one = budget()
+    return dict(
+        starts=one.starts,
+        episodes=one.study_episodes,
+        horizon=one.horizon,
+        iterations=one.search_iterations,
+    )
+
+
+def trained_robots(robots) -> list[str]:
+    """Those of `robots` that have a shipped agent, in that order."""
+    folder = data_dir() / "checkpoints"
+    return [name for name in robots if (folder / agent_name(name) / "agent.json").exists()]
 
 
 def agent_name(robot: str) -> str:
@@ -96,217 +117,101 @@ def result(name: str, compute: Callable[[], list[dict]], agent=None, recompute=F
     Returns:
         {"records": [...], "provenance": {...}}.
     """
+    return result_in_parts(name, {"all": compute}, agent, recompute, **config)
+
+
+def result_in_parts(
+    name: str,
+    parts: dict[str, Callable[[], list[dict]]],
+    agent=None,
+    recompute: bool = False,
+    progress: bool = False,
+    **config,
+):
+    """`result` for long computations: each part is stored as soon as it is done.
+
+    A computation that was interrupted goes on with the first part that is missing. The file may
+    hold more parts than are asked for.
+
+    Args:
+        name, agent, config: see `result`.
+        recompute: compute these parts anew; others in the file stay.
+        parts: by name, functions that return the records of one part.
+        progress: print a line per part that is computed.
+
+    Returns:
+        {"records": those of `parts`, in that order, "provenance": {...}}; "seconds" there is the
+        sum over these parts.
+    """
     suffix = "" if scale() == "reduced" else f"_{scale()}"
     path = data_dir() / "results" / f"{name}{suffix}.json"
     config = json.loads(json.dumps(config))
-    if path.exists() and not recompute and scale() != "smoke":
-        try:
-            stored = json.loads(path.read_text())
-            source, _ = stored["provenance"], stored["records"]
-            same = source["config"] == config
-            if agent is not None:
-                known = source["agent"]
-                same &= known["hash"] == agent.hash
-                same &= known.get("states_hash", agent.states_hash) == agent.states_hash
-        except (json.JSONDecodeError, KeyError, TypeError) as error:
-            raise ValueError(
-                f"{path.name} in data/results is damaged ({error}); delete it, or call with "
-                "recompute=True"
-            ) from error
-        if same:
-            return stored
-    began = time.perf_counter()
-    records = compute()
-    seconds = time.perf_counter() - began
-    stored = {"records": records, "provenance": provenance(agent, seconds, **config)}
-    if scale() != "smoke":
-        path.parent.mkdir(parents=True, exist_ok=True)
-        temporary = path.with_name(path.name + ".tmp")
-        temporary.write_text(json.dumps(stored, indent=1) + "\n")
-        os.replace(temporary, path)
-    return stored
-
-
-# ------------------------------------------------------------------ single-robot design (4.1)
-
-
-def single_robot_design(agent, robot, trust_regions=(20.0, 100.0), **settings) -> list[dict]:
-    """VGDS and the penalty alone from the paper's start designs, and VGDS from the reference.
-
-    Args:
-        agent, robot: who is asked, and about which robot.
-        trust_regions: λ of VGDS.
-        settings: see `design_study`, whose records are returned.
-    """
-    runs = [("start", "penalty-only", None)]
-    for trust_region in trust_regions:
-        runs += [("start", "vgds", trust_region), ("reference", "vgds", trust_region)]
-    return design_study(agent, robot, runs, **settings)
-
-
-def design_study(
-    agent,
-    robot,
-    runs,
-    starts: int = 10,
-    episodes: int = 200,
-    horizon: int = 1000,
-    seed: int = 0,
-    progress: bool = False,
-) -> list[dict]:
-    """Search for designs in several ways and let the frozen policy walk with all of them.
-
-    Every found design, every start and the reference are evaluated on the same episodes of
-    `horizon` control steps.
-
-    Args:
-        agent, robot: who is asked, and about which robot.
-        runs: searches (origin, method, λ). origin "start": from the paper's start designs, all in
-            one batch; "reference": from f = 0. The penalty alone has no λ (None), because Adam
-            removes the scale of its gradient.
-        starts: number of start designs.
-        episodes: evaluation episodes per design.
-        seed: of the searches and of the evaluation.
-        progress: show the evaluation's progress.
-
-    Returns:
-        One record per design: origin, start number, method ("none" for the designs where searches
-        begin), trust_region, the search's seconds per design (without compilation), critic
-        evaluations per design, mean return, its deviation over episodes, the gain over the design
-        where the search began with its 95 % interval over paired episodes, tracking error (m/s),
-        length (control steps), number of episodes that became non-finite, predicted value (mean
-        critic value over the state bank, without penalty) and distance |f - f_ref| / sqrt(d).
-    """
-    from shapebody.design import DesignSpace
-    from shapebody.evaluation import evaluate, paired_gain
-    from shapebody.search import Objective, search
-
-    space = DesignSpace(robot)
-    initial = {
-        "start": np.stack([space.start(i) for i in range(starts)]),
-        "reference": space.reference[None],
-    }
-    designs, records = [], []
-
-    def add(origin, method, trust_region, found, seconds=0.0, evaluations=0):
-        for i, f in enumerate(found):
-            designs.append(f)
-            records.append(
-                {
-                    "origin": origin,
-                    "start": i if origin == "start" else None,
-                    "method": method,
-                    "trust_region": trust_region,
-                    "search_seconds": seconds / len(found),
-                    "evaluations": evaluations,
-                }
-            )
-
-    for origin, f in initial.items():
-        add(origin, "none", None, f)
-    for origin, method, trust_region in runs:
-        given = 100.0 if trust_region is None else trust_region
-        found = search(method, agent, robot, initial[origin], trust_region=given, seed=seed)
-        seconds = found.seconds - found.compile_seconds
-        add(origin, method, trust_region, found.design, seconds, found.evaluations)
-    designs = np.stack(designs)
-    predicted = Objective.of(agent, robot, 0.0).value(designs)
-    config = _evaluation(episodes, horizon)
-    score = evaluate(agent, robot, designs, seed=seed, config=config, progress=progress)
-    for i, record in enumerate(records):
-        began = starts if record["origin"] == "reference" else record["start"]
-        gain = paired_gain(score.returns[i], score.returns[began])
-        record |= {
-            "return": float(score.returns[i].mean()),
-            "return_std": float(score.returns[i].std(ddof=1)) if episodes > 1 else 0.0,
-            "gain": gain.mean,
-            "gain_low": gain.low,
-            "gain_high": gain.high,
-            "non_finite": int(score.non_finite[i]),
-            "tracking_error": float(score.tracking_error[i].mean()),
-            "length": float(score.lengths[i].mean()),
-            "predicted_value": float(predicted[i]),
-            "distance": float(np.sqrt(np.mean(designs[i] ** 2))),
-            "episodes": episodes,
-            "engine": score.settings["engine"],
-        }
-    return records
-
-
-def _evaluation(episodes: int, horizon: int):
-    from shapebody.evaluation import EvaluationConfig
-    from shapebody.locomotion import TaskConfig
-
-    return EvaluationConfig(episodes=episodes, task=TaskConfig.evaluation(horizon=horizon))
-
-
-def gains(records: list[dict]) -> list[dict]:
-    """Gains in return ΔR with 95 % intervals, from the records of `design_study`.
-
-    Returns:
-        One record per comparison: method, over ("start", "penalty-only" or "reference"),
-        trust_region (None where none was used), mean, low and high of the paired difference in
-        return, the number of pairs, and how many of them are positive. The pairs are the starts;
-        for the search from the reference they are the episodes of one pair of designs.
-
-    Raises:
-        ValueError: if a design has no counterpart to be compared with.
-    """
-    from shapebody.evaluation import paired_gain
-
-    found: dict = {}
-    for record in records:
-        if record["origin"] == "start":
-            key = record["method"], record["trust_region"]
-            found.setdefault(key, {})[record["start"]] = record["return"]
-    reference = [r for r in records if r["origin"] == "reference"]
-    base = [r["return"] for r in reference if r["method"] == "none"]
-    initial = found.get(("none", None), {})
-    if len(base) != 1 or not initial:
-        raise ValueError(
-            f"the records hold {len(base)} evaluations of the reference and {len(initial)} of "
-            "starts; expected one and at least one, as design_study returns them"
-        )
-    rows = []
-
-    def compare(method, over, trust_region, after, before):
-        if after.keys() != before.keys():
-            raise ValueError(
-                f"{method} at lambda {trust_region} has starts {sorted(after)}, {over} has "
-                f"{sorted(before)}; both need the same, compute the records anew"
-            )
-        order = sorted(after)
-        gain = paired_gain([after[i] for i in order], [before[i] for i in order])
-        row(method, over, trust_region, *gain[:3], len(order), int(np.sum(gain.differences > 0)))
-
-    def row(method, over, trust_region, mean, low, high, pairs, positive):
-        values = dict(mean=mean, low=low, high=high, pairs=pairs, positive=positive)
-        rows.append({"method": method, "over": over, "trust_region": trust_region, **values})
-
-    compare("reference", "start", None, dict.fromkeys(initial, base[0]), initial)
-    for (method, trust_region), after in found.items():
-        if method == "none":
+    kept = scale() != "smoke"
+    known = _known_parts(path, agent, config, recompute) if kept else {}
+    for number, (part, compute) in enumerate(parts.items(), 1):
+        if part in known and not recompute:
             continue
-        compare(method, "start", trust_region, after, initial)
-        if method != "penalty-only":
-            control = found.get(("penalty-only", None))
-            if control is not None:
-                compare(method, "penalty-only", trust_region, after, control)
-    for r in reference:
-        if r["method"] != "none":
-            interval = r["gain"], r["gain_low"], r["gain_high"]
-            row(r["method"], "reference", r["trust_region"], *interval, r["episodes"], None)
-    return rows
+        began = time.perf_counter()
+        records = compute()
+        source = provenance(agent, time.perf_counter() - began, **config)
+        known[part] = {"records": records, "provenance": source}
+        if kept:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            temporary = path.with_name(path.name + ".tmp")
+            temporary.write_text(_one_record_per_line(known))
+            os.replace(temporary, path)
+        if progress:
+            seconds = source["seconds"]
+            print(f"{number} of {len(parts)}: {part}, {seconds:.0f} s", flush=True)
+    chosen = [known[part] for part in parts]
+    latest = chosen[-1]["provenance"]
+    seconds = round(sum(one["provenance"]["seconds"] for one in chosen), 1)
+    return {
+        "records": [record for one in chosen for record in one["records"]],
+        "provenance": {**latest, "seconds": seconds},
+    }
 
 
-def gain(rows: list[dict], method: str, over: str, trust_region: float | None = None) -> dict:
-    """The one row of `gains` with that method, comparison and λ; ValueError if there is none."""
-    wanted = {"method": method, "over": over, "trust_region": trust_region}
-    for row in rows:
-        if all(row[name] == value for name, value in wanted.items()):
-            return row
-    known = ", ".join(f"{r['method']} over {r['over']} at {r['trust_region']}" for r in rows)
-    raise ValueError(f"there is no gain of {method} over {over} at {trust_region}; known: {known}")
+def _known_parts(path, agent, config, overwrite: bool) -> dict:
+    """The parts in a result's file, if they belong to this agent and these settings.
+
+    A damaged file has none if it is to be overwritten anyway.
+    """
+    if not path.exists():
+        return {}
+    try:
+        known = json.loads(path.read_text())["parts"]
+        for part in known.values():
+            source, _ = part["provenance"], part["records"]
+            same = source["config"] == config and isinstance(source["seconds"], float)
+            if agent is not None:
+                same &= source["agent"]["hash"] == agent.hash
+                same &= source["agent"]["states_hash"] == agent.states_hash
+            if not same:
+                return {}
+    except (json.JSONDecodeError, KeyError, TypeError, AttributeError) as error:
+        if overwrite:
+            return {}
+        raise ValueError(
+            f"{path.name} in data/results is damaged ({error}); delete it, or call with "
+            "recompute=True"
+        ) from error
+    return known
+
+
+def _one_record_per_line(parts: dict) -> str:
+    """JSON of a result, short enough to read and to compare line by line."""
+    texts = []
+    for name, part in parts.items():
+        source = json.dumps(part["provenance"])
+        records = ",\n".join(f"   {json.dumps(record)}" for record in part["records"])
+        texts.append(
+            f' {json.dumps(name)}: {{\n  "provenance": {source},\n  "records": [\n{records}\n  ]}}'
+        )
+    return '{"parts": {\n' + ",\n".join(texts) + "\n}}\n"
+
+
+# ------------------------------------------------------------------ statistics
 
 
 def verdict(low: float, high: float) -> str:
@@ -340,39 +245,6 @@ def rank_correlation(x, y, resamples: int = 2000, seed: int = 0) -> tuple[float,
     samples = samples[np.isfinite(samples)]
     low, high = np.quantile(samples, [0.025, 0.975]) if len(samples) else (np.nan, np.nan)
     return float(correlation(x, y)), float(low), float(high)
-
-
-def value_against_return(
-    agent,
-    robot,
-    designs: int = 256,
-    episodes: int = 8,
-    horizon: int = 1000,
-    seed: int = 1000,
-    progress: bool = False,
-) -> list[dict]:
-    """Predicted value and true return of random designs of the full design space.
-
-    Returns:
-        One record per design: its number, predicted value and mean return.
-    """
-    from shapebody.design import DesignSpace
-    from shapebody.evaluation import evaluate
-    from shapebody.search import Objective
-
-    space = DesignSpace(robot)
-    f = np.stack([space.start(seed + i) for i in range(designs)])
-    predicted = np.asarray(Objective.of(agent, robot, 0.0).value(f))
-    config = _evaluation(episodes, horizon)
-    score = evaluate(agent, robot, f, seed=seed, config=config, progress=progress)
-    return [
-        {
-            "design": seed + i,
-            "predicted_value": float(predicted[i]),
-            "return": float(score.returns[i].mean()),
-        }
-        for i in range(designs)
-    ]
 
 
 def scales_table() -> list[dict]:

@@ -4,7 +4,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from shapebody import experiments
+from shapebody import experiments, studies
 
 AGENT = SimpleNamespace(name="a", hash="1234", states_hash="56", metadata={"steps": 7})
 
@@ -52,7 +52,8 @@ def test_result_is_computed_once_and_loaded_afterwards(results):
     first = experiments.result("x", compute, AGENT, starts=2)
     second = experiments.result("x", compute, AGENT, starts=2)
     assert compute.calls == 1
-    assert first == second == json.loads((results / "x.json").read_text())
+    assert first == second
+    assert list(json.loads((results / "x.json").read_text())) == ["parts"]
     source = {"name": "a", "hash": "1234", "states_hash": "56", "steps": 7}
     assert first["provenance"]["agent"] == source
 
@@ -90,7 +91,8 @@ def test_smoke_scale_neither_reads_nor_writes(results, monkeypatch):
 
 
 @pytest.mark.parametrize(
-    "text", ["", "{", "[]", "{}", '{"provenance": {"config": {}}}', '{"provenance": 1}']
+    "text",
+    ["", "{", "[]", "{}", '{"parts": {"all": {"provenance": {"config": {}}}}}', '{"parts": 1}'],
 )
 def test_damaged_file_is_reported_and_can_be_recomputed(results, text):
     results.mkdir()
@@ -112,12 +114,35 @@ def test_interrupted_computation_leaves_the_file_as_it_was(results):
     assert (results / "x.json").read_text() == before
 
 
+def test_parts_are_stored_one_by_one_and_an_interruption_keeps_them(results):
+    one, two = Computation(), Computation()
+
+    def interrupted():
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        experiments.result_in_parts("x", {"one": one, "two": interrupted}, AGENT, starts=2)
+    stored = experiments.result_in_parts("x", {"one": one, "two": two}, AGENT, starts=2)
+    assert (one.calls, two.calls) == (1, 1)
+    assert stored["records"] == [{"call": 1}, {"call": 1}]
+    # Another selection, in another order, is read from the same file.
+    three = {"three": Computation(), "one": one}
+    assert len(experiments.result_in_parts("x", three, AGENT, starts=2)["records"]) == 2
+    assert list(json.loads((results / "x.json").read_text())["parts"]) == ["one", "two", "three"]
+    assert one.calls == 1
+    # Other settings make all parts another result.
+    experiments.result_in_parts("x", {"one": one}, AGENT, starts=3)
+    assert list(json.loads((results / "x.json").read_text())["parts"]) == ["one"]
+    assert one.calls == 2
+
+
 # gains
 
 
 def record(origin, start, method, trust_region, value, **more):
     keys = dict(origin=origin, start=start, method=method, trust_region=trust_region)
-    return {**keys, "return": value, "episodes": 4, **more}
+    returns = [value - 1, value + 1]
+    return {**keys, "return": value, "returns": returns, "tracking_error": 1 / value, **more}
 
 
 def synthetic(vgds=(7.0, 9.0, 8.0), penalty=(6.0, 7.5, 7.0)):
@@ -126,32 +151,35 @@ def synthetic(vgds=(7.0, 9.0, 8.0), penalty=(6.0, 7.5, 7.0)):
     records += [record("start", i, "vgds", 20.0, x) for i, x in enumerate(vgds)]
     # The order of records must not matter.
     records += [record("start", i, "penalty-only", None, x) for i, x in enumerate(penalty)][::-1]
-    records.append(record("reference", None, "none", None, 5.0, gain=0.0))
-    interval = dict(gain=0.5, gain_low=0.2, gain_high=0.8)
-    return records + [record("reference", None, "vgds", 20.0, 5.5, **interval)]
+    records.append(record("reference", None, "none", None, 5.0))
+    return records + [record("reference", None, "vgds", 20.0, 5.5, returns=[4.6, 6.4])]
 
 
 def test_gains_are_paired_by_start():
-    rows = experiments.gains(synthetic())
-    one = experiments.gain(rows, "vgds", "penalty-only", 20.0)
+    rows = studies.gains(synthetic())
+    one = studies.gain(rows, "vgds", "penalty-only", 20.0)
     assert one["mean"] == pytest.approx((1 + 1.5 + 1) / 3)
     assert 1 <= one["low"] <= one["mean"] <= one["high"] <= 1.5
     assert (one["pairs"], one["positive"]) == (3, 3)
-    assert experiments.gain(rows, "vgds", "start", 20.0)["mean"] == pytest.approx(6)
-    assert experiments.gain(rows, "penalty-only", "start")["mean"] == pytest.approx(29 / 6)
-    reference = experiments.gain(rows, "reference", "start")
+    assert studies.gain(rows, "vgds", "start", 20.0)["mean"] == pytest.approx(6)
+    assert studies.gain(rows, "penalty-only", "start")["mean"] == pytest.approx(29 / 6)
+    reference = studies.gain(rows, "reference", "start")
     assert (reference["mean"], reference["positive"]) == (pytest.approx(3), 3)
-    own = experiments.gain(rows, "vgds", "reference", 20.0)
-    assert (own["mean"], own["low"], own["high"], own["pairs"]) == (0.5, 0.2, 0.8, 4)
+    own = studies.gain(rows, "vgds", "reference", 20.0)
+    assert (own["mean"], own["low"], own["high"]) == pytest.approx((0.5, 0.4, 0.6))
+    assert (own["pairs"], own["positive"]) == (2, 2)
+    errors = studies.gains(synthetic(), "tracking_error")
+    reduced = studies.gain(errors, "penalty-only", "start")["mean"]
+    assert reduced == pytest.approx(np.mean([1 / 6 - 1, 1 / 7.5 - 1 / 2, 1 / 7 - 1 / 3]))
 
 
 def test_gains_of_incomplete_records():
     with pytest.raises(ValueError, match="both need the same"):
-        experiments.gains(synthetic(penalty=(6.0, 7.5)))
+        studies.gains(synthetic(penalty=(6.0, 7.5)))
     with pytest.raises(ValueError, match="0 evaluations of the reference"):
-        experiments.gains(synthetic()[:9])
+        studies.gains(synthetic()[:9])
     with pytest.raises(ValueError, match="no gain of vgds over start at 5"):
-        experiments.gain(experiments.gains(synthetic()), "vgds", "start", 5.0)
+        studies.gain(studies.gains(synthetic()), "vgds", "start", 5.0)
 
 
 @pytest.mark.parametrize(

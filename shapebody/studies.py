@@ -1,0 +1,266 @@
+"""Design studies: searches from the paper's start designs, and what the designs are worth.
+
+Section 4.1 (methods), Appendix D (trust region).
+"""
+
+from functools import partial
+from typing import NamedTuple
+
+import numpy as np
+
+from shapebody import paper
+from shapebody.design import DesignSpace
+from shapebody.evaluation import EvaluationConfig, evaluate, paired_gain
+from shapebody.experiments import result_in_parts
+from shapebody.locomotion import TaskConfig
+from shapebody.search import METHODS, Objective, search
+
+
+class Run(NamedTuple):
+    """One search of a design study."""
+
+    method: str
+    """A name in `search.METHODS`."""
+    trust_region: float | None = 100.0
+    """λ. None for the penalty alone: Adam removes the scale of its gradient, so it has none."""
+    origin: str = "start"
+    """"start": from the paper's start designs, all in one batch; "reference": from f = 0."""
+
+
+CONTROL = Run("penalty-only", None)
+TRUST_REGION_RUNS = (CONTROL, *(Run("vgds", float(value)) for value in paper.LAMBDAS))
+"""VGDS at all λ of Appendix D, and its control."""
+SINGLE_ROBOT_RUNS = (
+    CONTROL,
+    Run("vgds", 20.0),
+    Run("vgds", 100.0),
+    Run("vgds", 20.0, "reference"),
+    Run("vgds", 100.0, "reference"),
+)
+"""What the critic adds to the pull of the trust region, from afar and from the reference."""
+METHOD_RUNS = (CONTROL, *(Run(name) for name in METHODS if name != "penalty-only"))
+"""All methods at the paper's λ (Section 4.1, Appendix C)."""
+
+
+def design_study(
+    agent,
+    robot,
+    runs=SINGLE_ROBOT_RUNS,
+    starts: int = 10,
+    episodes: int = 200,
+    horizon: int = 1000,
+    seed: int = 0,
+    iterations: int | None = None,
+    recompute: bool = False,
+    progress: bool = False,
+) -> dict:
+    """Search for designs in several ways and let the frozen policy walk with all of them.
+
+    Every found design, every start and the reference are evaluated on the same episodes of
+    `horizon` control steps. The result is kept in data/results, run by run (`result_in_parts`).
+
+    Args:
+        agent, robot: who is asked, and about which robot.
+        runs: the searches.
+        starts: number of start designs.
+        episodes: evaluation episodes per design.
+        seed: of the searches and of the evaluation.
+        iterations: of every search; the paper's number for each method if not given.
+        recompute: search and evaluate anew.
+        progress: print a line per run.
+
+    Returns:
+        {"records": ..., "provenance": ...} with one record per design: origin, start number,
+        method ("none" for the designs where searches begin), trust_region, the search's seconds
+        per design (without compilation), critic evaluations per design, mean return, the returns
+        of all episodes, tracking error (m/s), length (control steps), number of episodes that
+        became non-finite, predicted value (mean critic value over the state bank, without
+        penalty), distance |f - f_ref| / sqrt(d), and the curve of the search: evaluations and
+        objective (on the whole state bank) at some of its iterations.
+    """
+    setting = dict(starts=starts, episodes=episodes, horizon=horizon, seed=seed)
+    short = {} if iterations is None else {"iterations": iterations}
+    parts = {"starts and reference": partial(_initial_records, agent, robot, **setting)}
+    for run in runs:
+        text = "" if run.trust_region is None else f", lambda {run.trust_region:g}"
+        where = "starts" if run.origin == "start" else run.origin
+        parts[f"{run.method}{text}, from the {where}"] = partial(
+            _run_records, agent, robot, run, short, **setting
+        )
+    return result_in_parts(
+        f"design_study_{robot.name}", parts, agent, recompute, progress, **setting, **short
+    )
+
+
+def installed(runs) -> tuple[Run, ...]:
+    """Those of `runs` whose libraries are there: "bo" needs the extra `bo`."""
+    from importlib.util import find_spec
+
+    return tuple(run for run in runs if run.method != "bo" or find_spec("botorch"))
+
+
+CURVE_POINTS = 21
+"""Iterations of a search at which its record holds the objective."""
+
+
+def _origins(space, origin: str, starts: int):
+    if origin == "reference":
+        return space.reference[None]
+    return np.stack([space.start(i) for i in range(starts)])
+
+
+def _initial_records(agent, robot, starts, **setting):
+    space = DesignSpace(robot)
+    run = Run("none", None)
+    records = _evaluated(agent, robot, run, _origins(space, "start", starts), **setting)
+    run = run._replace(origin="reference")
+    return records + _evaluated(agent, robot, run, _origins(space, "reference", 1), **setting)
+
+
+def _run_records(agent, robot, run: Run, short, starts, seed, **setting):
+    initial = _origins(DesignSpace(robot), run.origin, starts)
+    given = 100.0 if run.trust_region is None else run.trust_region
+    found = search(run.method, agent, robot, initial, trust_region=given, seed=seed, **short)
+    records = _evaluated(agent, robot, run, found.design, seed=seed, **setting)
+    last = len(found.trajectory) - 1
+    rows = np.unique(np.linspace(0, last, CURVE_POINTS).round().astype(int))
+    objective = Objective.of(agent, robot, given)
+    curves = np.stack([np.asarray(objective(found.trajectory[row])) for row in rows], 1)
+    for record, curve in zip(records, curves, strict=True):
+        record |= {
+            "search_seconds": (found.seconds - found.compile_seconds) / len(initial),
+            "evaluations": found.evaluations,
+            "curve_evaluations": [round(found.evaluations * row / last) for row in rows.tolist()],
+            "curve_objective": [round(float(value), 4) for value in curve],
+        }
+    return records
+
+
+def _evaluated(agent, robot, run: Run, designs, seed, episodes, horizon):
+    """A record per design; designs of one run differ in the start they came from."""
+    predicted = Objective.of(agent, robot, 0.0).value(designs)
+    score = evaluate(agent, robot, designs, seed=seed, config=_evaluation(episodes, horizon))
+    return [
+        {
+            "origin": run.origin,
+            "start": i if run.origin == "start" else None,
+            "method": run.method,
+            "trust_region": run.trust_region,
+            "return": float(score.returns[i].mean()),
+            "tracking_error": float(score.tracking_error[i].mean()),
+            "length": float(score.lengths[i].mean()),
+            "non_finite": int(score.non_finite[i]),
+            "predicted_value": float(predicted[i]),
+            "distance": float(np.sqrt(np.mean(designs[i] ** 2))),
+            "engine": score.settings["engine"],
+            "returns": [round(value, 3) for value in score.returns[i].tolist()],
+        }
+        for i in range(len(designs))
+    ]
+
+
+def _evaluation(episodes: int, horizon: int):
+    return EvaluationConfig(episodes=episodes, task=TaskConfig.evaluation(horizon=horizon))
+
+
+def gains(records: list[dict], quantity: str = "return") -> list[dict]:
+    """Gains in return ΔR with 95 % intervals, from the records of `design_study`.
+
+    Args:
+        records: of one robot.
+        quantity: "return"; or another number of a record, such as "tracking_error", for
+            comparisons between starts (those from the reference are left out).
+
+    Returns:
+        One record per comparison: method, over ("start", "penalty-only" or "reference"),
+        trust_region (None where none was used), mean, low and high of the paired difference in
+        return, the number of pairs, and how many of them are positive. The pairs are the starts;
+        for the search from the reference they are the episodes of one pair of designs.
+
+    Raises:
+        ValueError: if a design has no counterpart to be compared with.
+    """
+    found: dict = {}
+    for record in records:
+        if record["origin"] == "start":
+            key = record["method"], record["trust_region"]
+            found.setdefault(key, {})[record["start"]] = record[quantity]
+    reference = [r for r in records if r["origin"] == "reference"]
+    base = [r for r in reference if r["method"] == "none"]
+    initial = found.get(("none", None), {})
+    if len(base) != 1 or not initial:
+        raise ValueError(
+            f"the records hold {len(base)} evaluations of the reference and {len(initial)} of "
+            "starts; expected one and at least one, as design_study returns them"
+        )
+    rows = []
+
+    def compare(method, over, trust_region, after, before):
+        if after.keys() != before.keys():
+            raise ValueError(
+                f"{method} at lambda {trust_region} has starts {sorted(after)}, {over} has "
+                f"{sorted(before)}; both need the same, compute the records anew"
+            )
+        order = sorted(after)
+        gain = paired_gain([after[i] for i in order], [before[i] for i in order])
+        row(method, over, trust_region, *gain[:3], len(order), int(np.sum(gain.differences > 0)))
+
+    def row(method, over, trust_region, mean, low, high, pairs, positive):
+        values = dict(mean=mean, low=low, high=high, pairs=pairs, positive=positive)
+        rows.append({"method": method, "over": over, "trust_region": trust_region, **values})
+
+    compare("reference", "start", None, dict.fromkeys(initial, base[0][quantity]), initial)
+    for (method, trust_region), after in found.items():
+        if method == "none":
+            continue
+        compare(method, "start", trust_region, after, initial)
+        if method != "penalty-only":
+            control = found.get(("penalty-only", None))
+            if control is not None:
+                compare(method, "penalty-only", trust_region, after, control)
+    for r in reference:
+        if r["method"] != "none" and quantity == "return":
+            own = paired_gain(r["returns"], base[0]["returns"])
+            positive = int(np.sum(own.differences > 0))
+            row(r["method"], "reference", r["trust_region"], *own[:3], len(r["returns"]), positive)
+    return rows
+
+
+def gain(rows: list[dict], method: str, over: str, trust_region: float | None = None) -> dict:
+    """The one row of `gains` with that method, comparison and λ; ValueError if there is none."""
+    wanted = {"method": method, "over": over, "trust_region": trust_region}
+    for row in rows:
+        if all(row[name] == value for name, value in wanted.items()):
+            return row
+    known = ", ".join(f"{r['method']} over {r['over']} at {r['trust_region']}" for r in rows)
+    raise ValueError(f"there is no gain of {method} over {over} at {trust_region}; known: {known}")
+
+
+def value_against_return(
+    agent,
+    robot,
+    designs: int = 256,
+    episodes: int = 8,
+    horizon: int = 1000,
+    seed: int = 1000,
+    progress: bool = False,
+) -> list[dict]:
+    """Predicted value and true return of random designs of the full design space.
+
+    Returns:
+        One record per design: its number, predicted value and mean return.
+    """
+
+    space = DesignSpace(robot)
+    f = np.stack([space.start(seed + i) for i in range(designs)])
+    predicted = np.asarray(Objective.of(agent, robot, 0.0).value(f))
+    config = _evaluation(episodes, horizon)
+    score = evaluate(agent, robot, f, seed=seed, config=config, progress=progress)
+    return [
+        {
+            "design": seed + i,
+            "predicted_value": float(predicted[i]),
+            "return": float(score.returns[i].mean()),
+        }
+        for i in range(designs)
+    ]

@@ -1,0 +1,107 @@
+"""Design studies: searches, their evaluation, and the file that keeps both."""
+
+import json
+
+import numpy as np
+import pytest
+from tiny import quick_compilation, tiny_agent, tiny_robot
+
+from shapebody import paper, studies
+from shapebody.design import DesignSpace
+from shapebody.evaluation import EvaluationConfig, evaluate
+from shapebody.locomotion import TaskConfig
+from shapebody.search import METHODS, Objective, search
+from shapebody.studies import CONTROL, Run, design_study
+
+RUNS = (CONTROL, Run("vgds", 20.0), Run("cem"), Run("vgds", 100.0, "reference"))
+SETTING = dict(starts=2, episodes=3, horizon=12, iterations=2)
+
+
+@pytest.fixture(scope="module", autouse=True)
+def quick():
+    with quick_compilation():
+        yield
+
+
+@pytest.fixture
+def results(tmp_path, monkeypatch):
+    monkeypatch.setenv("SHAPEBODY_DATA", str(tmp_path))
+    monkeypatch.setenv("SHAPEBODY_SCALE", "reduced")
+    return tmp_path / "results"
+
+
+@pytest.fixture(scope="module")
+def robot(tmp_path_factory):
+    return tiny_robot(tmp_path_factory.mktemp("robot"))
+
+
+@pytest.fixture(scope="module")
+def agent(robot):
+    return tiny_agent(robot)
+
+
+def test_runs_are_the_papers():
+    lambdas = [run.trust_region for run in studies.TRUST_REGION_RUNS if run.method == "vgds"]
+    assert lambdas == list(paper.LAMBDAS)
+    assert {run.method for run in studies.METHOD_RUNS} == set(METHODS)
+    assert {run.trust_region for run in studies.METHOD_RUNS} == {None, 100.0}
+    assert CONTROL in studies.METHOD_RUNS and CONTROL in studies.TRUST_REGION_RUNS
+    assert studies.installed((CONTROL, Run("cem"))) == (CONTROL, Run("cem"))
+
+
+def test_records_are_what_search_and_evaluation_give(results, agent, robot):
+    study = design_study(agent, robot, RUNS, **SETTING)
+    records = study["records"]
+    assert [(r["method"], r["origin"], r["start"]) for r in records] == [
+        ("none", "start", 0),
+        ("none", "start", 1),
+        ("none", "reference", None),
+        ("penalty-only", "start", 0),
+        ("penalty-only", "start", 1),
+        ("vgds", "start", 0),
+        ("vgds", "start", 1),
+        ("cem", "start", 0),
+        ("cem", "start", 1),
+        ("vgds", "reference", None),
+    ]
+    assert study["provenance"]["agent"]["hash"] == agent.hash
+
+    space = DesignSpace(robot)
+    starts = np.stack([space.start(0), space.start(1)])
+    found = search("vgds", agent, robot, starts, trust_region=20.0, iterations=2)
+    task = TaskConfig.evaluation(horizon=12)
+    score = evaluate(agent, robot, found.design, config=EvaluationConfig(episodes=3, task=task))
+    for i, record in enumerate(records[5:7]):
+        np.testing.assert_allclose(record["returns"], score.returns[i], atol=6e-4)
+        assert record["return"] == pytest.approx(score.mean[i], abs=1e-4)
+        assert record["tracking_error"] == pytest.approx(score.mean_tracking_error[i], abs=1e-5)
+        value = Objective.of(agent, robot, 0.0).value(found.design[i])
+        assert record["predicted_value"] == pytest.approx(float(value), abs=1e-4)
+        assert record["evaluations"] == found.evaluations == 2
+        assert record["curve_evaluations"] == [0, 1, 2]
+        assert record["curve_objective"][-1] == pytest.approx(found.objective[i], abs=2e-4)
+    # The same episodes for all designs.
+    rows = studies.gains(records)
+    own = studies.gain(rows, "vgds", "reference", 100.0)
+    assert own["pairs"] == 3
+    assert studies.gain(rows, "cem", "penalty-only", 100.0)["pairs"] == 2
+
+
+def test_what_is_stored_is_not_computed_again(results, agent, robot, monkeypatch):
+    first = design_study(agent, robot, RUNS[:2], **SETTING)
+    searched = []
+
+    def spy(method, *arguments, **options):
+        searched.append(method)
+        return search(method, *arguments, **options)
+
+    monkeypatch.setattr(studies, "search", spy)
+    second = design_study(agent, robot, RUNS[:3], **SETTING)
+    assert searched == ["cem"]
+    assert second["records"][:7] == first["records"]
+    (path,) = results.iterdir()
+    assert path.name == f"design_study_{robot.name}.json"
+    assert len(json.loads(path.read_text())["parts"]) == 4
+    design_study(agent, robot, RUNS[:1], recompute=True, **SETTING)
+    assert searched == ["cem", "penalty-only"]
+    assert len(json.loads(path.read_text())["parts"]) == 4
