@@ -1,4 +1,4 @@
-"""Command line: python -m shapebody train | sharpen | design | evaluate | validate."""
+"""Command line: python -m shapebody train | anneal | sharpen | design | evaluate | validate."""
 
 import argparse
 import os
@@ -20,6 +20,13 @@ def main(arguments=None) -> int:
     train.add_argument("--hours", type=float, help="stop after this time; run again to continue")
     train.add_argument("--steps", type=int, help="stop at this many environment steps in all")
     train.add_argument("--engine", choices=("auto", "native", "mjx"), default="auto")
+
+    anneal = commands.add_parser(
+        "anneal", help="save an agent from an unfinished run, after a last part at a falling rate"
+    )
+    anneal.add_argument("agent")
+    anneal.add_argument("--steps", type=int, default=1_640_000, help="of that part")
+    anneal.add_argument("--hours", type=float, help="stop after this time; run again to continue")
 
     sharpen = commands.add_parser(
         "sharpen", help="policy evaluation: a new critic for an agent's frozen policy"
@@ -49,15 +56,19 @@ def main(arguments=None) -> int:
     options = parser.parse_args(arguments)
     if options.command == "validate":
         return _validate(options)
-    if options.command in ("train", "sharpen"):
+    if options.command in ("train", "anneal", "sharpen"):
         os.environ["XLA_FLAGS"] = f"{os.environ.get('XLA_FLAGS', '')} {_FLAG}".strip()
     from shapebody.runtime import enable_compilation_cache
 
     enable_compilation_cache()
     try:
-        {"train": _train, "sharpen": _sharpen, "design": _design, "evaluate": _evaluate}[
-            options.command
-        ](options)
+        {
+            "train": _train,
+            "anneal": _anneal,
+            "sharpen": _sharpen,
+            "design": _design,
+            "evaluate": _evaluate,
+        }[options.command](options)
     except (ValueError, OSError) as error:
         print(f"shapebody: {error}", file=sys.stderr)
         return 1
@@ -76,6 +87,17 @@ def _train(options):
     seconds = None if options.hours is None else 3600 * options.hours
     agent = train(config, max_steps=options.steps, max_seconds=seconds, engine=options.engine)
     print(f"agent {agent.name}: {agent.metadata['steps']:,} steps")
+
+
+def _anneal(options):
+    from shapebody.ppo import anneal
+
+    seconds = None if options.hours is None else 3600 * options.hours
+    agent = anneal(options.agent, options.steps, max_seconds=seconds)
+    if agent is None:
+        print("not finished: the agent is as it was, the same command continues")
+    else:
+        print(f"agent {agent.name}: {agent.metadata['steps']:,} steps")
 
 
 def _sharpen(options):

@@ -143,10 +143,7 @@ def result_in_parts(
         {"records": those of `parts`, in that order, "provenance": {...}}; "seconds" there is the
         sum over these parts.
     """
-    suffix = "" if scale() == "reduced" else f"_{scale()}"
-    path = data_dir() / "results" / f"{name}{suffix}.json"
-    config = json.loads(json.dumps(config))
-    kept = scale() != "smoke"
+    path, kept = _result_path(name), scale() != "smoke"
     known = _known_parts(path, agent, config, recompute) if kept else {}
     for number, (part, compute) in enumerate(parts.items(), 1):
         if part in known and not recompute:
@@ -172,6 +169,18 @@ def result_in_parts(
     }
 
 
+def stored_parts(name: str, agent=None, **config) -> list[str]:
+    """Names of the parts that `result_in_parts` would load for these arguments."""
+    if scale() == "smoke":
+        return []
+    return list(_known_parts(_result_path(name), agent, config, overwrite=False))
+
+
+def _result_path(name: str):
+    suffix = "" if scale() == "reduced" else f"_{scale()}"
+    return data_dir() / "results" / f"{name}{suffix}.json"
+
+
 def _known_parts(path, agent, config, overwrite: bool) -> dict:
     """The parts in a result's file, if they belong to this agent and these settings.
 
@@ -179,6 +188,7 @@ def _known_parts(path, agent, config, overwrite: bool) -> dict:
     """
     if not path.exists():
         return {}
+    config = json.loads(json.dumps(config))
     try:
         known = json.loads(path.read_text())["parts"]
         for part in known.values():

@@ -17,12 +17,13 @@ import csv
 import hashlib
 import io
 import json
+import shutil
 import sys
 import time
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, field, is_dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, get_type_hints
 
 import jax
 import jax.numpy as jnp
@@ -30,6 +31,7 @@ import numpy as np
 import optax
 
 from shapebody.checkpoints import Agent, atomic_write, load_arrays, save_agent, save_arrays
+from shapebody.files import read_safetensors
 from shapebody.locomotion import Locomotion, TaskConfig, Trajectory
 from shapebody.networks import (
     Critic,
@@ -543,13 +545,17 @@ class Trainer:
             metadata=metadata,
         )
 
-    def save_agent(self) -> Agent:
-        """Write the agent as trained so far, with a fresh state bank and its learning curve."""
+    def save_agent(self, folder=None) -> Agent:
+        """Write the agent as trained so far, with a fresh state bank and its learning curve.
+
+        folder: where to; the run's own if not given.
+        """
+        folder = Path(folder) if folder else self.folder
         agent = self.agent(self.state_bank())
-        save_agent(agent, self.folder)
+        save_agent(agent, folder)
         curve = self.folder / "training.csv"
         if curve.exists():
-            atomic_write(self.folder / "curve.csv", curve.read_text())
+            atomic_write(folder / "curve.csv", curve.read_text())
         return agent
 
     # -------------------------------------------------------------- the loop
@@ -679,6 +685,84 @@ def train(
     return trainer.save_agent()
 
 
+STATE_FILES = ("training.safetensors", "training.json", "training.csv")
+"""A run in its folder: its state, its configurations and its learning curve."""
+
+
+def anneal(
+    name: str,
+    steps: int = 1_640_000,
+    last_rate: float = 2e-5,
+    folder=None,
+    progress: bool = True,
+    max_seconds: float | None = None,
+    engine: str = "auto",
+) -> Agent | None:
+    """Save a good agent from a run that is not at its end.
+
+    A large learning rate learns fast and leaves the policy noisy; lowering it brings a gain that
+    comes only once. So a copy of the run goes on for some steps while the rate falls, and the
+    agent is the copy's. The run itself stays where it is and can go on as fast as before.
+
+    Args:
+        name: of the agent whose run is in data/checkpoints/<name>.
+        steps: environment steps of the copy.
+        last_rate: its learning rate at the end; linear from the run's present one.
+        folder: of the run, instead of data/checkpoints/<name>. The agent is saved there; the copy
+            is in a folder in it until it is finished.
+        progress, max_seconds, engine: see `train`. A copy that was stopped is continued.
+
+    Returns:
+        The agent; None if the copy was stopped before its end, which leaves the old agent.
+
+    Raises:
+        ValueError: if there is no such run, or its files are damaged.
+    """
+    folder = Path(folder) if folder else data_dir() / "checkpoints" / name
+    copy = folder / "annealed"
+    if not (copy / "training.safetensors").exists():
+        _begin_annealing(folder, copy, steps, last_rate)
+    saved = json.loads((copy / "training.json").read_text())[-1]["config"]
+    config = _from_plain(TrainConfig, saved)
+    trainer = Trainer(config, copy, engine)
+    trainer.start()
+    _run(trainer, progress, None, max_seconds)
+    if trainer.steps < config.iterations * config.batch:
+        return None
+    agent = trainer.save_agent(folder)
+    shutil.rmtree(copy)
+    return agent
+
+
+def _begin_annealing(folder: Path, copy: Path, steps: int, last_rate: float) -> None:
+    """Copy a run's files, with a new phase: `steps` more, and a rate that falls to `last_rate`."""
+    missing = [file for file in STATE_FILES if not (folder / file).exists()]
+    if missing:
+        raise ValueError(f"there is no run to anneal in {folder.name}: {missing[0]} is missing")
+    # The state is read first: curve rows that are newer than it do no harm.
+    fix = "restore it, or train anew"
+    state = (folder / STATE_FILES[0]).read_bytes()
+    done = int(read_safetensors(folder / STATE_FILES[0], fix)["learner/iteration"])
+    phases = json.loads((folder / "training.json").read_text())
+    config = dict(phases[-1]["config"])
+    batch = config["num_envs"] * config["rollout_length"]
+    first, last = config["learning_rate"]
+    total = config["total_steps"] // batch
+    rate = first + (last - first) * min(done / max(total, 1), 1.0)
+    more = max(1, round(steps / batch))
+    # Linear over the whole run, through the present rate now and the last one at the end.
+    slope = (last_rate - rate) / more
+    config |= {
+        "total_steps": (done + more) * batch,
+        "learning_rate": [rate - slope * done, last_rate],
+    }
+    phases.append({"from_step": done * batch, "config": config})
+    atomic_write(copy / "training.json", json.dumps(phases, indent=1) + "\n")
+    atomic_write(copy / "training.csv", (folder / "training.csv").read_text())
+    # The state comes last: a copy without it is made again.
+    atomic_write(copy / "training.safetensors", state)
+
+
 def train_critic(
     agent: Agent,
     critic: CriticConfig,
@@ -752,6 +836,18 @@ def _run(trainer: Trainer, progress, max_steps, max_seconds) -> None:
 def _plain(config: TrainConfig) -> dict:
     """A configuration as it reads back from JSON: tuples are lists."""
     return json.loads(json.dumps(asdict(config)))
+
+
+def _from_plain(kind, values: dict):
+    """The inverse of `_plain`: a configuration from what was read from JSON."""
+
+    def value(hint, given):
+        if is_dataclass(hint):
+            return _from_plain(hint, given)
+        return tuple(value(None, x) for x in given) if isinstance(given, list) else given
+
+    hints = get_type_hints(kind)
+    return kind(**{name: value(hints.get(name), given) for name, given in values.items()})
 
 
 SCHEDULE = ("total_steps", "epochs", "minibatch_size", "learning_rate", "state_bank")

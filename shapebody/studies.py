@@ -11,7 +11,7 @@ import numpy as np
 from shapebody import paper
 from shapebody.design import DesignSpace
 from shapebody.evaluation import EvaluationConfig, evaluate, paired_gain
-from shapebody.experiments import result_in_parts
+from shapebody.experiments import result_in_parts, stored_parts
 from shapebody.locomotion import TaskConfig
 from shapebody.search import METHODS, Objective, search
 
@@ -82,14 +82,18 @@ def design_study(
     short = {} if iterations is None else {"iterations": iterations}
     parts = {"starts and reference": partial(_initial_records, agent, robot, **setting)}
     for run in runs:
-        text = "" if run.trust_region is None else f", lambda {run.trust_region:g}"
-        where = "starts" if run.origin == "start" else run.origin
-        parts[f"{run.method}{text}, from the {where}"] = partial(
-            _run_records, agent, robot, run, short, **setting
-        )
-    return result_in_parts(
-        f"design_study_{robot.name}", parts, agent, recompute, progress, **setting, **short
-    )
+        parts[_part(run)] = partial(_run_records, agent, robot, run, short, **setting)
+    return result_in_parts(_file(robot), parts, agent, recompute, progress, **setting, **short)
+
+
+def _file(robot) -> str:
+    return f"design_study_{robot.name}"
+
+
+def _part(run: Run) -> str:
+    text = "" if run.trust_region is None else f", lambda {run.trust_region:g}"
+    where = "starts" if run.origin == "start" else run.origin
+    return f"{run.method}{text}, from the {where}"
 
 
 def installed(runs) -> tuple[Run, ...]:
@@ -97,6 +101,28 @@ def installed(runs) -> tuple[Run, ...]:
     from importlib.util import find_spec
 
     return tuple(run for run in runs if run.method != "bo" or find_spec("botorch"))
+
+
+def available(
+    agent,
+    robot,
+    runs,
+    starts: int = 10,
+    episodes: int = 200,
+    horizon: int = 1000,
+    seed: int = 0,
+    iterations: int | None = None,
+    recompute: bool = False,
+) -> tuple[Run, ...]:
+    """Those of `runs` that `design_study` can return here for the same arguments.
+
+    All but "bo" always; "bo" where its libraries are `installed`, or where its part is stored.
+    """
+    setting = dict(starts=starts, episodes=episodes, horizon=horizon, seed=seed)
+    short = {} if iterations is None else {"iterations": iterations}
+    stored = [] if recompute else stored_parts(_file(robot), agent, **setting, **short)
+    here = installed(runs)
+    return tuple(run for run in runs if run in here or _part(run) in stored)
 
 
 CURVE_POINTS = 21

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from shapebody import ppo
-from shapebody.checkpoints import load_agent
+from shapebody.checkpoints import load_agent, load_curve
 from shapebody.networks import CriticConfig
 
 
@@ -130,6 +130,39 @@ def test_a_run_continues_only_with_its_own_configuration(config, tmp_path):
     (tmp_path / "agent.json").write_text("{}")
     with pytest.raises(ValueError, match="would overwrite"):
         longer.start()
+
+
+def test_annealing_leaves_the_run_as_it_is(config, tmp_path, monkeypatch):
+    config = replace(config, num_envs=8, minibatch_size=32, epochs=1, name="walker")
+    with pytest.raises(ValueError, match="training.safetensors is missing"):
+        ppo.anneal("walker", folder=tmp_path)
+    trainer = ppo.Trainer(config, tmp_path)
+    trainer.start()
+    trainer.run(max_steps=2 * config.batch, progress=False)
+    before = {file: (tmp_path / file).read_bytes() for file in ppo.STATE_FILES}
+    rate = np.interp(2 / config.iterations, [0, 1], config.learning_rate)
+
+    steps, last_rate = 3 * config.batch, 1e-6
+    # A time limit stops it early; the same call goes on with what is left.
+    arguments = dict(steps=steps, last_rate=last_rate, folder=tmp_path, progress=False)
+    assert ppo.anneal("walker", max_seconds=0.0, **arguments) is None
+    assert not (tmp_path / "agent.json").exists()
+    agent = ppo.anneal("walker", **arguments)
+    assert agent.metadata["steps"] == 5 * config.batch
+    assert load_agent(tmp_path).hash == agent.hash
+    assert {file: (tmp_path / file).read_bytes() for file in ppo.STATE_FILES} == before
+    assert not (tmp_path / "annealed").exists()
+    phase = agent.metadata["phases"][-1]
+    first, last = phase["config"]["learning_rate"]
+    assert (phase["from_step"], last) == (2 * config.batch, last_rate)
+    assert np.interp(2 / 5, [0, 1], [first, last]) == pytest.approx(rate)
+    rows = load_curve(tmp_path)
+    assert rows["steps"][-1] == 5 * config.batch
+
+
+def test_configurations_read_back_from_json():
+    for config in (ppo.TrainConfig.full("unitree_go2"), ppo.TrainConfig.smoke("golem", seed=3)):
+        assert ppo._from_plain(ppo.TrainConfig, ppo._plain(config)) == config
 
 
 def test_names_of_agents():

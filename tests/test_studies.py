@@ -105,3 +105,20 @@ def test_what_is_stored_is_not_computed_again(results, agent, robot, monkeypatch
     design_study(agent, robot, RUNS[:1], recompute=True, **SETTING)
     assert searched == ["cem", "penalty-only"]
     assert len(json.loads(path.read_text())["parts"]) == 4
+
+
+def test_available_runs_are_installed_or_stored(results, agent, robot, monkeypatch):
+    runs = (CONTROL, Run("bo"), Run("vgds", 20.0))
+    monkeypatch.setattr(
+        studies, "installed", lambda runs: tuple(run for run in runs if run.method != "bo")
+    )
+    assert studies.available(agent, robot, runs, **SETTING) == (CONTROL, runs[2])
+    monkeypatch.setattr(
+        studies, "search", lambda method, *rest, **options: search("random", *rest, **options)
+    )
+    design_study(agent, robot, runs[1:2], **SETTING)
+    assert studies.available(agent, robot, runs, **SETTING) == runs
+    for other in (dict(SETTING, starts=3), dict(SETTING, recompute=True)):
+        assert studies.available(agent, robot, runs, **other) == (CONTROL, runs[2])
+    monkeypatch.setenv("SHAPEBODY_SCALE", "smoke")
+    assert studies.available(agent, robot, runs, **SETTING) == (CONTROL, runs[2])
