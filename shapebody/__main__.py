@@ -19,6 +19,9 @@ def main(arguments=None) -> int:
     train.add_argument("--scale", choices=("smoke", "reduced", "full"), help="default: reduced")
     train.add_argument("--hours", type=float, help="stop after this time; run again to continue")
     train.add_argument("--steps", type=int, help="stop at this many environment steps in all")
+    train.add_argument(
+        "--state-only", action="store_true", help="leave the saved agent as it is; anneal later"
+    )
     train.add_argument("--engine", choices=("auto", "native", "mjx"), default="auto")
 
     anneal = commands.add_parser(
@@ -40,6 +43,7 @@ def main(arguments=None) -> int:
     design.add_argument("--agent", help="default: the agent named as the robot")
     design.add_argument("--method", default="vgds")
     design.add_argument("--start", type=int, help="start design number (default: the reference)")
+    design.add_argument("--seed", type=int, default=0)
     design.add_argument("--trust-region", type=float, default=100.0, help="lambda (default 100)")
     design.add_argument("--out", help="write the found body to this MJCF file")
 
@@ -48,6 +52,8 @@ def main(arguments=None) -> int:
     evaluate.add_argument("--robot", help="default: the agent's first robot")
     evaluate.add_argument("--start", type=int, help="start design number (default: the reference)")
     evaluate.add_argument("--episodes", type=int, default=200)
+    evaluate.add_argument("--seed", type=int, default=0, help="of the episodes")
+    evaluate.add_argument("--engine", choices=("auto", "native", "mjx"), default="auto")
 
     validate = commands.add_parser("validate", help="what the method sees in a robot file")
     validate.add_argument("robot", help="an MJCF or URDF file, or a name in data/robots")
@@ -85,8 +91,10 @@ def _train(options):
     config = TrainConfig.at_scale(options.scale or scale(), options.robots[0], **changes)
     config = as_continued(config)
     seconds = None if options.hours is None else 3600 * options.hours
-    agent = train(config, max_steps=options.steps, max_seconds=seconds, engine=options.engine)
-    print(f"agent {agent.name}: {agent.metadata['steps']:,} steps")
+    limits = dict(max_steps=options.steps, max_seconds=seconds)
+    agent = train(config, engine=options.engine, state_only=options.state_only, **limits)
+    if agent is not None:
+        print(f"agent {agent.name}: {agent.metadata['steps']:,} steps")
 
 
 def _anneal(options):
@@ -124,7 +132,9 @@ def _design(options):
     agent = load_agent(options.agent or robot.name)
     space = DesignSpace(robot)
     f = space.reference if options.start is None else space.start(options.start)
-    found = search(options.method, agent, robot, f, trust_region=options.trust_region)
+    found = search(
+        options.method, agent, robot, f, trust_region=options.trust_region, seed=options.seed
+    )
     print(f"{found.method}: {found.evaluations} critic evaluations, {found.seconds:.1f} s")
     objective = Objective.of(agent, robot, options.trust_region)
     print(f"objective {float(objective(f[None])[0]):.2f} -> {found.objective:.2f}")
@@ -160,7 +170,9 @@ def _evaluate(options):
     robot = load_robot(options.robot or agent.metadata["config"]["robots"][0])
     space = DesignSpace(robot)
     f = space.reference if options.start is None else space.start(options.start)
-    score = evaluate(agent, robot, f, episodes=options.episodes)
+    score = evaluate(
+        agent, robot, f, episodes=options.episodes, seed=options.seed, engine=options.engine
+    )
     low, high = score.interval()
     print(f"return {score.mean:.2f} (95 % interval {low:.2f} to {high:.2f})")
     print(f"x-y tracking error {score.tracking_error.mean():.3f} m/s")

@@ -482,3 +482,320 @@ def check_twelve_motors(path, motors: int = 12) -> None:
         "add 13.",
         f"The report still says: {left[0]}" if left else "",
     )
+
+
+# ------------------------------------------------------------------ 07 trust region
+
+
+def check_penalty_coefficient(function) -> None:
+    """Exercise: the λ at which a uniformly random design has a given mean penalty.
+
+    function: (mean penalty p, value a of all entries of the reference) -> λ.
+    """
+    if _waiting(function, "write a function (p, a) and hand it over."):
+        return
+    if not callable(function):
+        print("Not yet. Hand over the function itself, without calling it.")
+        return
+    for p, a in ((33.0, 0.0), (10.0, 0.0), (10.0, 0.5), (4.0, -1.0)):
+        given = function(p, a)
+        if given is None:
+            print("Not answered yet: the function returns None.")
+            return
+        given = _number(given)
+        if given is None:
+            return
+        expected = p / (1 / 3 + a * a)
+
+        def near(value, given=given):
+            return abs(given - value) < 1e-3 * abs(value)
+
+        if near(expected):
+            continue
+        if a and near(3 * p):
+            hint = "That is right for a = 0; the mean of (f - a)² also has a part from a."
+        elif a and near(p / (1 / 3 - a * a)):
+            hint = "A reference away from the middle makes the penalty larger, for both signs of a."
+        elif near(p / (1 / 12 + a * a)):
+            hint = "1/12 is the variance on an interval of length 1; ours has length 2."
+        elif near(p / (1 / 2 + a * a)):
+            hint = "The penalty squares the entries: take the mean of f², not that of |f|."
+        else:
+            hint = "Find the mean of (f - a)² for one entry f; all entries have the same."
+        print(f"Not yet. For p = {p:g} and a = {a:g}: {hint}")
+        return
+    _say(True, "For a = 0 it is 3 p: at λ = 100 a random design pays about 33.", "")
+
+
+def check_held_out(answer, gains, trust_regions) -> None:
+    """Exercise: choose λ on the first half of the starts, and test it on the others.
+
+    answer: (λ, its mean gain on the first half, its mean gain on the other starts).
+    gains: [λ, start]. trust_regions: the λ of its rows.
+    """
+    if _waiting(answer, "three numbers (λ, mean on the first half, mean on the second half)."):
+        return
+    try:
+        given = np.array([float(x) for x in answer])
+    except (TypeError, ValueError):
+        given = np.array([])
+    if given.shape != (3,) or not np.isfinite(given).all():
+        print(f"Not yet. The answer is {answer!r}; it should be three numbers.")
+        return
+    from itertools import combinations
+
+    gains, trust_regions = np.asarray(gains, float), np.asarray(trust_regions, float)
+    count = gains.shape[1]
+
+    def halves(chosen):
+        inside = np.isin(np.arange(count), chosen)
+        first, second = gains[:, inside].mean(1), gains[:, ~inside].mean(1)
+        best = int(np.argmax(first))
+        return trust_regions[best], first[best], second[best]
+
+    expected = halves(range(count // 2))
+    if abs(given[0] - expected[0]) > 1e-6:
+        at_all = trust_regions[int(np.argmax(gains.mean(1)))]
+        hint = "Take the largest mean over the first half of the columns."
+        if abs(given[0] - at_all) < 1e-6:
+            hint = "That λ is the best on all starts; the second half must not be asked yet."
+        print(f"Not yet. λ = {given[0]:g} is not the one. {hint}")
+        return
+    for number, x, y in (("second", given[1], expected[1]), ("third", given[2], expected[2])):
+        if abs(x - y) > 1e-2 + 1e-3 * abs(y):
+            half = "first" if number == "second" else "other"
+            print(f"Not yet. The {number} number is the mean of that row over the {half} half.")
+            return
+    splits = list(combinations(range(count), count // 2))
+    _, inside, outside = np.mean([halves(chosen) for chosen in splits], axis=0)
+    _say(
+        True,
+        f"λ = {expected[0]:g} gains {expected[1]:+.2f} where it was chosen and {expected[2]:+.2f} "
+        f"elsewhere. Over all {len(splits)} ways of choosing the half: {inside:+.2f} and "
+        f"{outside:+.2f}, overstated by {inside - outside:.2f} on average.",
+        "",
+    )
+
+
+# ------------------------------------------------------------------ 08 VGDS versus baselines
+
+
+def check_cem_generation(function) -> None:
+    """Exercise: one generation of the cross-entropy method.
+
+    function: (designs [P, d], scores [P], CEMConfig) -> (mean [d], standard deviations [d]) of the
+    next Gaussian.
+    """
+    if _waiting(function, "write the function and hand it over."):
+        return
+    if not callable(function):
+        print("Not yet. Hand over the function itself, without calling it.")
+        return
+    from shapebody.search.populations import CEMConfig
+
+    generator = np.random.default_rng(0)
+    for config, spread in (
+        (CEMConfig(), 0.4),
+        (CEMConfig(particles=10, elite_fraction=0.3), 0.4),
+        (CEMConfig(), 0.01),
+    ):
+        designs = np.clip(generator.normal(0.2, spread, (config.particles, 6)), -1, 1)
+        scores = generator.normal(size=config.particles)
+        given = function(designs.copy(), scores.copy(), config)
+        if given is None:
+            print("Not answered yet: the function returns None.")
+            return
+        try:
+            mean, std = (np.asarray(x, float) for x in given)
+        except (TypeError, ValueError):
+            mean = std = np.empty(0)
+        if mean.shape != (6,) or std.shape != (6,):
+            print("Not yet. Expected two arrays of the length of a design: mean and deviations.")
+            return
+        order = np.argsort(scores)
+        elites, losers = designs[order[-config.elites :]], designs[order[: config.elites]]
+        if not np.allclose(mean, elites.mean(0), atol=1e-5):
+            lost = np.allclose(mean, losers.mean(0), atol=1e-5)
+            hint = "These are the worst ones; scores are maximized." if lost else ""
+            print(
+                f"Not yet. The mean is not that of the {config.elites} best of "
+                f"{config.particles} designs. {hint}".rstrip()
+            )
+            return
+        if np.allclose(std, np.maximum(elites.std(0), config.minimum_std), atol=1e-5):
+            continue
+        if np.allclose(std, elites.std(0), atol=1e-5):
+            hint = f"No deviation may fall below {config.minimum_std:g}, or the search freezes."
+        elif np.allclose(std, np.maximum(elites.std(0, ddof=1), config.minimum_std), atol=1e-5):
+            hint = "Divide by the number of elites, not by one less (ddof=0)."
+        else:
+            hint = "It is one number per parameter, over the elites."
+        print(f"Not yet. The mean is right, the deviations are not. {hint}")
+        return
+    _say(True, "The search method does the same in every generation.", "")
+
+
+def check_climb(propose, update) -> None:
+    """Exercise: hill climbing, as two functions of the contract `search.loop.Steps`.
+
+    propose: (config, memory, key) -> designs [P, d] in [-1, 1]; update: (config, memory, scored,
+    key) -> next memory. config has particles and std, memory is a NamedTuple of the design [d].
+    """
+    from collections import namedtuple
+    from types import SimpleNamespace
+
+    import jax
+    import jax.numpy as jnp
+
+    from shapebody.search.loop import Scored
+
+    Memory = namedtuple("Memory", "design")
+    config = SimpleNamespace(particles=16, std=0.1)
+    generator = np.random.default_rng(0)
+    optimum = jnp.asarray(generator.uniform(-0.7, 0.7, 10), jnp.float32)
+    starts = [np.ones(10, np.float32), generator.uniform(-1, 1, 10).astype(np.float32)]
+    proposer = jax.jit(lambda memory, key: propose(config, memory, key))
+    updater = jax.jit(lambda memory, scored, key: update(config, memory, scored, key))
+    for start in starts:
+        memory = Memory(jnp.asarray(start))
+        for key in jax.random.split(jax.random.key(0), 150):
+            try:
+                designs = proposer(memory, key)
+                if designs is None:
+                    print("Not answered yet: propose returns None.")
+                    return
+                if designs.shape != (config.particles, 10):
+                    print(
+                        f"Not yet. Proposals have shape {designs.shape}; expected one row for each "
+                        f"of the {config.particles} particles, ({config.particles}, 10)."
+                    )
+                    return
+                values = -jnp.mean((designs - optimum) ** 2, -1)
+                current = -jnp.mean((memory.design - optimum) ** 2)
+                memory = updater(memory, Scored(designs, values, None, current), key)
+            except jax.errors.ConcretizationTypeError:
+                print("Not yet. Compiled code cannot use if or while on arrays; use jnp.where.")
+                return
+            if memory is None:
+                print("Not answered yet: update returns None.")
+                return
+            if not isinstance(memory, Memory) or jnp.shape(memory.design) != (10,):
+                print("Not yet. update has to return memory._replace(design=...), one design.")
+                return
+            if float(jnp.abs(designs).max()) > 1:
+                print("Not yet. A proposal leaves the box [-1, 1]; clip it.")
+                return
+            if float(-jnp.mean((memory.design - optimum) ** 2)) < float(current) - 1e-6:
+                print(
+                    "Not yet. The search moved to a worse design. Compare scored.values of the "
+                    "best proposal with scored.current."
+                )
+                return
+        left = float(jnp.sum((memory.design - optimum) ** 2) / np.sum((start - optimum) ** 2))
+        if left > 0.1:
+            print(
+                f"Not yet. After 150 iterations {left:.0%} of the squared distance to the optimum "
+                "remain. Do proposals depend on the key, and does the best of them win?"
+            )
+            return
+    _say(True, f"It stops within {left:.1%} of the first squared distance to the optimum.", "")
+
+
+# ------------------------------------------------------------------ 09 design trajectories
+
+
+def check_pair_distance(function) -> None:
+    """Exercise: mean root-mean-square distance over all pairs of designs, without a loop.
+
+    function: (designs [S, d], S >= 2) -> one number.
+    """
+    if _waiting(function, "write the function and hand it over."):
+        return
+    if not callable(function):
+        print("Not yet. Hand over the function itself, without calling it.")
+        return
+    from itertools import combinations
+
+    generator = np.random.default_rng(0)
+    for count, dim in ((2, 1), (3, 4), (10, 7)):
+        designs = generator.uniform(-1, 1, (count, dim)).astype(np.float32)
+        given = function(designs.copy())
+        if given is None:
+            print("Not answered yet: the function returns None.")
+            return
+        given = _number(given)
+        if given is None:
+            return
+        pairs = [np.mean((a - b) ** 2, dtype=float) for a, b in combinations(designs, 2)]
+        expected = np.mean(np.sqrt(pairs))
+        wrong = {
+            expected * (count - 1) / count: "The zeros on the diagonal are no pairs: divide by "
+            f"S (S - 1) = {count * (count - 1)} instead of S² = {count**2}.",
+            expected * np.sqrt(dim): "That is the Euclidean distance; divide the sum of squares by "
+            "d before the square root.",
+            np.mean(pairs): "The square root is missing.",
+            np.sqrt(np.mean(pairs)): "Take the root of every pair first, then the mean.",
+        }
+        if abs(given - expected) < 1e-4:
+            continue
+        hints = [hint for value, hint in wrong.items() if abs(given - value) < 1e-4]
+        print(
+            f"Not yet. For {count} designs of {dim} entries a loop gives {expected:.4f} and the "
+            f"function {given:.4f}. {' '.join(hints[:1])}".rstrip()
+        )
+        return
+    _say(True, "It agrees with a loop over all pairs.", "")
+
+
+def check_covered(function, trajectory) -> None:
+    """Exercise: the first iteration at which a start has covered 90 % of its way.
+
+    function: (trajectory [N + 1, d] of one start) -> n, the first with
+    |f_n - f_N| <= 0.1 |f_0 - f_N|. trajectory: [N + 1, S, d] of a search, to say what it finds.
+    """
+    if _waiting(function, "write the function and hand it over."):
+        return
+    if not callable(function):
+        print("Not yet. Hand over the function itself, without calling it.")
+        return
+
+    def covered(path):
+        left = np.linalg.norm(path - path[-1], axis=-1)
+        return int(np.argmax(left <= 0.1 * left[0]))
+
+    generator = np.random.default_rng(0)
+    slow = 0.3 + np.outer(0.9 ** np.arange(41), generator.uniform(-0.5, 0.5, 5))
+    turns = np.cos(0.4 * np.arange(41)) * 0.93 ** np.arange(41)
+    swinging = np.outer(turns, generator.uniform(-0.5, 0.5, 5)) - 0.2
+    real = np.asarray(trajectory, float)
+    for path in (slow, swinging, *np.moveaxis(real, 1, 0)):
+        given = function(path.copy())
+        if given is None:
+            print("Not answered yet: the function returns None.")
+            return
+        given = _number(given)
+        if given is None:
+            return
+        if given == covered(path):
+            continue
+        left = np.linalg.norm(path - path[-1], axis=-1)
+        steps = np.linalg.norm(np.diff(path, axis=0), axis=-1).cumsum()
+        to_reference = np.linalg.norm(path, axis=-1)
+        wrong = {
+            int(np.argmax(left <= 0.9 * left[0])): "That is 10 % of the way.",
+            1 + int(np.argmax(steps >= 0.9 * steps[-1])): "That is 90 % of the length of the path, "
+            "with all its turns; measure how far it still is to the end.",
+            int(np.argmax(to_reference <= 0.1 * to_reference[0])): "Measure the distance to the "
+            "last design; the search need not end at the reference.",
+            covered(path) + 1: "Row 0 is the start itself, so row n is iteration n.",
+            int(np.flatnonzero(left > 0.1 * left[0])[-1]) + 1: "It comes so near earlier already; "
+            "the first time counts.",
+        }
+        print(
+            f"Not yet. Here it is iteration {covered(path)}, not {given:g}. "
+            f"{wrong.get(int(given), '')}".rstrip()
+        )
+        return
+    found = [covered(path) for path in np.moveaxis(real, 1, 0)]
+    last = len(real) - 1
+    _say(True, f"These starts need {min(found)} to {max(found)} of {last} iterations.", "")

@@ -1,9 +1,12 @@
 """Designs as scenes to turn and zoom in the browser, with MeshCat's viewer.
 
-A `Scene` is one HTML page of about 0.9 MB with everything inside. It needs no server, so it also
-works in a notebook that is opened later or somewhere else. `LiveScene` talks to a running viewer.
+A `Scene` is one HTML page of about 0.9 MB with everything inside (in a notebook it takes a third of
+that). It needs no server, so it also works in a notebook that is opened later or somewhere else.
+`LiveScene` talks to a running viewer.
 """
 
+import base64
+import gzip
 import html
 import importlib.util
 import json
@@ -52,7 +55,9 @@ class Scene:
         return path
 
     def _repr_html_(self) -> str:
-        page = html.escape(self.static_html(), quote=True)
+        packed = gzip.compress(self.static_html().encode(), mtime=0)
+        page = _PACKED.replace("@page@", base64.b64encode(packed).decode())
+        page = html.escape(page, quote=True)
         return (
             f'<iframe srcdoc="{page}" style="width: 100%; height: {self.height}px; border: 0">'
             "</iframe>"
@@ -83,6 +88,20 @@ for (const command of @commands@) {
 viewer.gui.close();
 </script>
 </body></html>
+"""
+# A page that unpacks another one in its place. Browsers can do that since 2023.
+_PACKED = """<!DOCTYPE html>
+<p>This scene needs scripts and a browser of 2023 or later.</p>
+<script>
+(async () => {
+  const packed = Uint8Array.from(atob("@page@"), (c) => c.charCodeAt(0));
+  const stream = new Blob([packed]).stream().pipeThrough(new DecompressionStream("gzip"));
+  const page = await new Response(stream).text();
+  document.open();
+  document.write(page);
+  document.close();
+})();
+</script>
 """
 
 

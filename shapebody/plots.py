@@ -88,6 +88,22 @@ def learning_curve(path: str | Path, y: str, x: str = "steps", ax=None, smooth: 
     return ax
 
 
+def intervals(labels: Sequence[str], values: Sequence, colours: Sequence = (), ax=None):
+    """Plot means with their intervals, one row each from the bottom up; returns the axes.
+
+    values: (mean, low, high) per label, or None for an empty row; colours: one per label, if any.
+    """
+    ax = ax or plt.gca()
+    for place, value in enumerate(values):
+        if value is not None:
+            mean, low, high = value
+            colour = colours[place] if len(colours) else COLOURS["blue"]
+            ax.plot([low, high], [place, place], color=colour, linewidth=2.5)
+            ax.plot(mean, place, "o", color=colour)
+    ax.set(yticks=range(len(labels)), yticklabels=labels, ylim=(-0.7, len(labels) - 0.3))
+    return ax
+
+
 @dataclass(frozen=True)
 class Table:
     """A table that a notebook shows as HTML, and a terminal as text."""

@@ -665,7 +665,8 @@ def train(
     max_steps: int | None = None,
     max_seconds: float | None = None,
     engine: str = "auto",
-) -> Agent:
+    state_only: bool = False,
+) -> Agent | None:
     """Train an agent, or continue its training, and save it.
 
     Args:
@@ -675,14 +676,15 @@ def train(
         progress: print return, tracking error, curriculum coefficient, speed and time left.
         max_steps, max_seconds: budgets of this call; the run can be continued later.
         engine: "auto", "native" or "mjx".
+        state_only: leave the agent in the folder as it is; the run can be annealed later.
 
     Returns:
-        The agent, with its state bank.
+        The agent, with its state bank; None with `state_only`.
     """
     trainer = Trainer(config, folder, engine)
     trainer.start()
     _run(trainer, progress, max_steps, max_seconds)
-    return trainer.save_agent()
+    return None if state_only else trainer.save_agent()
 
 
 STATE_FILES = ("training.safetensors", "training.json", "training.csv")

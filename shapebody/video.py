@@ -555,13 +555,19 @@ def show_video(frames: np.ndarray, fps: float = 25.0, width: int | None = None) 
     display(HTML(video_html(frames, fps, width)))
 
 
-def show_image(picture: np.ndarray, width: int | None = None) -> None:
-    """Show a picture in the notebook, as a PNG that also appears where scripts are not run."""
+def show_image(picture: np.ndarray, width: int | None = None, colours: int | None = None) -> None:
+    """Show a picture in the notebook, as a PNG that also appears where scripts are not run.
+
+    width: in pixels of the page. colours: only so many (2 to 256), which takes half of the bytes.
+    """
     from IPython.display import Image as Shown
     from IPython.display import display
 
+    image = Image.fromarray(np.asarray(picture))
+    if colours is not None:
+        image = image.quantize(colours)
     buffer = io.BytesIO()
-    Image.fromarray(np.asarray(picture)).save(buffer, format="PNG", optimize=True)
+    image.save(buffer, format="PNG", optimize=True)
     display(Shown(buffer.getvalue(), width=width))
 
 

@@ -3,6 +3,7 @@
 from types import SimpleNamespace
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -326,3 +327,230 @@ def test_twelve_motors(tmp_path, capsys):
         exercises.check_twelve_motors(legged(tmp_path, joints, [change]))
         text = said(capsys)
         assert text.startswith("Not yet") and hint in text
+
+
+# 08 VGDS versus baselines
+
+
+def generation(designs, scores, config):
+    elites = designs[np.argsort(scores)[-config.elites :]]
+    return elites.mean(axis=0), np.maximum(elites.std(axis=0), config.minimum_std)
+
+
+def test_cem_generation(capsys):
+    check = exercises.check_cem_generation
+    for answer in (None, lambda *_: None):
+        check(answer)
+        assert said(capsys).startswith("Not answered yet")
+    check(generation)
+    assert said(capsys).startswith("Right")
+
+    def other_deviation(change):
+        def function(designs, scores, config):
+            elites = designs[np.argsort(scores)[-config.elites :]]
+            return elites.mean(axis=0), change(elites, config.minimum_std)
+
+        return function
+
+    for answer, hint in (
+        (3, "the function itself"),
+        (lambda designs, scores, config: designs[0], "two arrays"),
+        (lambda designs, scores, config: 2, "two arrays"),
+        (lambda designs, scores, config: generation(designs, -scores, config), "the worst ones"),
+        (lambda designs, scores, config: (designs.mean(0), designs.std(0)), "best of 32 designs."),
+        (other_deviation(lambda elites, floor: elites.std(0)), "below 0.02"),
+        (other_deviation(lambda elites, floor: np.maximum(elites.std(0, ddof=1), floor)), "ddof"),
+        (other_deviation(lambda elites, floor: elites.var(0)), "one number per parameter"),
+    ):
+        check(answer)
+        text = said(capsys)
+        assert text.startswith("Not yet") and hint in text, text
+
+
+def test_the_exercise_is_what_cem_does():
+    from shapebody.search.loop import Scored
+    from shapebody.search.populations import _CEM, CEMConfig
+
+    rng = np.random.default_rng(3)
+    for spread in (0.3, 0.005):
+        designs = rng.normal(0, spread, (32, 4)).clip(-1, 1).astype(np.float32)
+        scores = rng.normal(size=32).astype(np.float32)
+        memory = _CEM.begin(CEMConfig(), designs[0], None)
+        memory = _CEM.update(CEMConfig(), memory, Scored(designs, scores, None, scores[0]), None)
+        mean, std = generation(designs, scores, CEMConfig())
+        np.testing.assert_allclose(memory.design, mean, atol=1e-6)
+        np.testing.assert_allclose(memory.std, std, atol=1e-6)
+
+
+def climb_propose(config, memory, key):
+    noise = jax.random.normal(key, (config.particles, len(memory.design)))
+    return jnp.clip(memory.design + config.std * noise, -1, 1)
+
+
+def climb_update(config, memory, scored, key):
+    best = jnp.argmax(scored.values)
+    better = scored.values[best] > scored.current
+    return memory._replace(design=jnp.where(better, scored.designs[best], memory.design))
+
+
+def test_climb(capsys):
+    check = exercises.check_climb
+    check(climb_propose, climb_update)
+    assert said(capsys).startswith("Right")
+
+    def nothing(config, memory, *_):
+        return None
+
+    for functions in ((nothing, nothing), (climb_propose, nothing)):
+        check(*functions)
+        assert said(capsys).startswith("Not answered yet")
+
+    def unclipped(config, memory, key):
+        return memory.design + jax.random.normal(key, (config.particles, len(memory.design)))
+
+    def single(config, memory, key):
+        return memory.design
+
+    def frozen(config, memory, key):
+        return jnp.tile(memory.design, (config.particles, 1))
+
+    def careless(config, memory, scored, key):
+        return memory._replace(design=scored.designs[0])
+
+    def branching(config, memory, scored, key):
+        best = scored.values.argmax()
+        return memory._replace(
+            design=scored.designs[best] if scored.values[best] > scored.current else memory.design
+        )
+
+    def bare(config, memory, scored, key):
+        return scored.designs[0]
+
+    for propose, update, hint in (
+        (unclipped, climb_update, "leaves the box"),
+        (single, climb_update, "expected one row"),
+        (frozen, climb_update, "remain"),
+        (climb_propose, careless, "worse design"),
+        (climb_propose, branching, "jnp.where"),
+        (climb_propose, bare, "_replace"),
+    ):
+        check(propose, update)
+        text = said(capsys)
+        assert text.startswith("Not yet") and hint in text, text
+
+
+def test_penalty_coefficient(capsys):
+    exercises.check_penalty_coefficient(None)
+    exercises.check_penalty_coefficient(lambda p, a: None)
+    assert said(capsys).count("Not answered yet") == 2
+    exercises.check_penalty_coefficient(lambda p, a: p / (1 / 3 + a**2))
+    assert said(capsys).startswith("Right")
+    wrong = {
+        "length 2": lambda p, a: p / (1 / 12 + a**2),
+        "mean of f²": lambda p, a: 2 * p,
+        "part from a": lambda p, a: 3 * p,
+        "both signs": lambda p, a: p / (1 / 3 - a**2),
+        "one entry": lambda p, a: p,
+        "one number": lambda p, a: "large",
+        "without calling": 99.0,
+    }
+    for hint, answer in wrong.items():
+        exercises.check_penalty_coefficient(answer)
+        text = said(capsys)
+        assert text.startswith("Not yet") and hint in text
+
+
+def test_held_out(capsys):
+    gains = np.array([[1.0, 1.0, 5.0, 5.0], [2.0, 2.0, 0.0, 1.0], [0.0, 0.0, 0.0, 0.0]])
+    lambdas = (0.0, 20.0, 100.0)
+    exercises.check_held_out(None, gains, lambdas)
+    assert said(capsys).startswith("Not answered yet")
+    exercises.check_held_out((20, 2.0, 0.5), gains, lambdas)
+    # Means of the chosen λ over the six splits, by hand: inside 19/6, outside 13.5/6.
+    assert "6 ways of choosing the half: +3.17 and +2.25, overstated by 0.92" in said(capsys)
+    wrong = {
+        "best on all starts": (0, 1.0, 5.0),
+        "largest mean": (100, 0.0, 0.0),
+        "second number": (20, 0.5, 2.0),
+        "third number": (20, 2.0, 2.0),
+        "three numbers": (20, 2.0),
+        "should be": "none",
+    }
+    for hint, answer in wrong.items():
+        exercises.check_held_out(answer, gains, lambdas)
+        text = said(capsys)
+        assert text.startswith("Not yet") and hint in text
+
+
+# 09 design trajectories
+
+
+def test_pair_distance(capsys):
+    check = exercises.check_pair_distance
+
+    def distances(x):
+        return np.sqrt(((x[:, None] - x[None]) ** 2).mean(-1))
+
+    def right(x):
+        return distances(x).sum() / (len(x) * (len(x) - 1))
+
+    check(None)
+    check(lambda x: None)
+    assert said(capsys).count("Not answered yet") == 2
+    check(right)
+    assert said(capsys).startswith("Right")
+    wrong = {
+        "diagonal": lambda x: distances(x).mean(),
+        "Euclidean": lambda x: right(x) * np.sqrt(x.shape[1]),
+        "every pair first": lambda x: np.sqrt((distances(x) ** 2).sum() / (len(x) * (len(x) - 1))),
+        "root is missing": lambda x: (distances(x) ** 2).sum() / (len(x) * (len(x) - 1)),
+        "a loop gives": lambda x: 0.0,
+        "one number": lambda x: distances(x),
+        "without calling": 0.5,
+    }
+    for hint, answer in wrong.items():
+        check(answer)
+        text = said(capsys)
+        assert text.startswith("Not yet") and hint in text, text
+
+
+def test_covered(capsys):
+    shrinking = np.array([0.9, 0.8])[:, None] ** np.arange(21)[:, None, None]
+    search = 0.1 + shrinking * np.array([0.5, -0.8, 0.3])  # 20 iterations from two starts
+
+    def left(path):
+        return np.linalg.norm(path - path[-1], axis=1)
+
+    def right(path):
+        return np.argmax(left(path) <= 0.1 * left(path)[0])
+
+    def along(path):
+        length = np.linalg.norm(np.diff(path, axis=0), axis=1).cumsum()
+        return 1 + np.argmax(length >= 0.9 * length[-1])
+
+    def settled(path):
+        return np.flatnonzero(left(path) > 0.1 * left(path)[0])[-1] + 1
+
+    def to_reference(path):
+        far = np.linalg.norm(path, axis=1)
+        return np.argmax(far <= 0.1 * far[0])
+
+    check = exercises.check_covered
+    check(None, search)
+    check(lambda path: None, search)
+    assert said(capsys).count("Not answered yet") == 2
+    check(right, search)
+    assert said(capsys).startswith("Right. These starts need")
+    wrong = {
+        "10 % of the way": lambda path: np.argmax(left(path) <= 0.9 * left(path)[0]),
+        "length of the path": along,
+        "reference": to_reference,
+        "row n is iteration n": lambda path: right(path) + 1,
+        "first time": settled,
+        "one number": lambda path: "soon",
+        "without calling": 7,
+    }
+    for hint, answer in wrong.items():
+        check(answer, search)
+        text = said(capsys)
+        assert text.startswith("Not yet") and hint in text, text

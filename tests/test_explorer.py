@@ -1,4 +1,8 @@
+import base64
+import gzip
+import html
 import json
+import re
 
 import mujoco
 import numpy as np
@@ -64,7 +68,12 @@ def test_animation_moves_only_what_changes():
 
 def test_notebook_shows_it_in_a_frame(tmp_path):
     scene = explorer.show_design(Space())
-    assert scene._repr_html_().startswith("<iframe srcdoc=")
+    shown = scene._repr_html_()
+    assert shown.startswith("<iframe srcdoc=")
+    assert shown == scene._repr_html_()
+    assert len(shown) < 0.4 * len(scene.static_html())
+    packed = re.search(r'atob\("([^"]+)"\)', html.unescape(shown)).group(1)
+    assert gzip.decompress(base64.b64decode(packed)).decode() == scene.static_html()
     assert scene.save(tmp_path / "robot.html").read_text() == scene.static_html()
 
 

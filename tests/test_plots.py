@@ -51,3 +51,15 @@ def test_table_escapes_html():
 def test_ragged_rows_are_refused():
     with pytest.raises(ValueError, match="3 cells"):
         plots.table([(1, 2, 3)], ("a", "b"))
+
+
+def test_intervals_have_one_row_each():
+    figure, ax = plt.subplots()
+    values = [(1.0, 0.5, 1.5), None, (3.0, 2.0, 5.0)]
+    assert plots.intervals(["a", "b", "c"], values, ["red", "green", "black"], ax) is ax
+    assert [label.get_text() for label in ax.get_yticklabels()] == ["a", "b", "c"]
+    bars, points = ax.get_lines()[::2], ax.get_lines()[1::2]
+    assert [list(bar.get_xdata()) for bar in bars] == [[0.5, 1.5], [2.0, 5.0]]
+    assert [point.get_ydata()[0] for point in points] == [0, 2]
+    assert [point.get_color() for point in points] == ["red", "black"]
+    plt.close(figure)

@@ -160,6 +160,13 @@ def test_annealing_leaves_the_run_as_it_is(config, tmp_path, monkeypatch):
     assert rows["steps"][-1] == 5 * config.batch
 
 
+def test_state_only_saves_no_agent(config, tmp_path):
+    config = replace(config, num_envs=8, minibatch_size=32, epochs=1)
+    arguments = dict(folder=tmp_path, progress=False, state_only=True)
+    assert ppo.train(config, max_steps=config.batch, **arguments) is None
+    assert (tmp_path / "training.safetensors").exists() and not (tmp_path / "agent.json").exists()
+
+
 def test_configurations_read_back_from_json():
     for config in (ppo.TrainConfig.full("unitree_go2"), ppo.TrainConfig.smoke("golem", seed=3)):
         assert ppo._from_plain(ppo.TrainConfig, ppo._plain(config)) == config

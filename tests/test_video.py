@@ -1,10 +1,12 @@
 import base64
+import io
 import subprocess
 import sys
 
 import mujoco
 import numpy as np
 import pytest
+from PIL import Image
 from walker import WALKER
 
 from shapebody import video
@@ -165,3 +167,15 @@ def test_wrong_input_is_named(model, call, message):
 def test_something_without_a_model_is_refused():
     with pytest.raises(TypeError, match="to_model"):
         video.render_frame(np.zeros(3))
+
+
+def test_fewer_colours_take_fewer_bytes(monkeypatch):
+    shown = []
+    monkeypatch.setattr("IPython.display.display", shown.append)
+    noise = np.random.default_rng(0).integers(0, 256, (40, 60, 3)).astype(np.uint8)
+    video.show_image(noise)
+    video.show_image(noise, colours=16)
+    every, few = (Image.open(io.BytesIO(picture.data)) for picture in shown)
+    assert np.array_equal(np.asarray(every), noise)
+    assert few.size == every.size and len(few.getcolors()) <= 16
+    assert len(shown[1].data) < len(shown[0].data) / 2
