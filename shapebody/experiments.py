@@ -39,7 +39,7 @@ class Budget:
 
 BUDGETS = {
     "smoke": Budget(2, 2, 2, 2, 4, 2, 512, 0.4, 2, 100),
-    "reduced": Budget(10, 50, 200, None, 256, 8, 400_000, 6.0, 12, 1000),
+    "reduced": Budget(10, 50, 50, None, 256, 8, 400_000, 6.0, 12, 1000),
     "full": Budget(10, 200, 200, None, 256, 32, 20_000_000, 10.0, 12, 1000),
 }
 """The table of scales. The method is the same at all of them."""
