@@ -14,6 +14,16 @@ def _waiting(answer, task: str) -> bool:
     return False
 
 
+def _is_function(answer, task: str) -> bool:
+    """Whether a function was handed over; says what is missing if not."""
+    if _waiting(answer, task):
+        return False
+    if not callable(answer):
+        print("Not yet. Hand over the function itself, without calling it.")
+        return False
+    return True
+
+
 def _say(right: bool, praise: str, hint: str) -> None:
     print(f"Right. {praise}" if right else f"Not yet. {hint}")
 
@@ -92,10 +102,9 @@ def check_total_mass(function, space) -> None:
 
     function: x -> kg, without calling Φ.
     """
-    if _waiting(function, "write a function of x and hand the function over, not a number."):
-        return
-    if not callable(function):
-        print("Not yet. Hand over the function itself, without calling it.")
+    if not _is_function(
+        function, "write a function of x and hand the function over, not a number."
+    ):
         return
     xs = np.array([-1.0, -0.4, 0.0, 0.3, 1.0], np.float32)
     designs = np.zeros((len(xs), space.dim), np.float32)
@@ -161,10 +170,7 @@ def check_reward(function) -> None:
 
     function: (terms [23], unweighted; coefficient c) -> reward.
     """
-    if _waiting(function, "write a function (terms, c) and hand the function over."):
-        return
-    if not callable(function):
-        print("Not yet. Hand over the function itself, without calling it.")
+    if not _is_function(function, "write a function (terms, c) and hand the function over."):
         return
     from shapebody.locomotion.rewards import combine
 
@@ -225,10 +231,7 @@ def check_gae(function) -> None:
 
     function: (reward [T], value [T], last_value, discount, gae_lambda) -> advantages [T].
     """
-    if _waiting(function, "write the function and hand it over."):
-        return
-    if not callable(function):
-        print("Not yet. Hand over the function itself, without calling it.")
+    if not _is_function(function, "write the function and hand it over."):
         return
     import jax.numpy as jnp
 
@@ -273,10 +276,7 @@ def check_gae(function) -> None:
 
 def check_surrogate(function, clip_range: float = 0.1) -> None:
     """Exercise: the clipped surrogate of PPO. function: (ratio, advantage) -> gain, arrays."""
-    if _waiting(function, "write the function and hand it over."):
-        return
-    if not callable(function):
-        print("Not yet. Hand over the function itself, without calling it.")
+    if not _is_function(function, "write the function and hand it over."):
         return
     ratio, advantage = (
         x.ravel() for x in np.meshgrid([0.5, 0.95, 1.0, 1.05, 1.5], [-2.0, -1.0, 0.0, 1.0, 2.0])
@@ -309,10 +309,7 @@ def check_surrogate(function, clip_range: float = 0.1) -> None:
 
 def check_step(function, max_update: float = 0.1) -> None:
     """Exercise: the two clips of eq. (7). function: (f [d], Adam's step [d]) -> next design [d]."""
-    if _waiting(function, "write the function and hand it over."):
-        return
-    if not callable(function):
-        print("Not yet. Hand over the function itself, without calling it.")
+    if not _is_function(function, "write the function and hand it over."):
         return
     f = np.array([0.0, 0.0, 0.0, 0.95, -0.95, 0.98, 1.0])
     step = np.array([0.05, 0.3, -0.3, 0.04, -0.4, -0.5, -0.02])
@@ -339,10 +336,7 @@ def check_radius(function, dim: int = 358) -> None:
 
     function: (one entry g of the value gradient, λ) -> |f - f_ref| where it balances the penalty.
     """
-    if _waiting(function, "write a function (g, λ) and hand it over."):
-        return
-    if not callable(function):
-        print("Not yet. Hand over the function itself, without calling it.")
+    if not _is_function(function, "write a function (g, λ) and hand it over."):
         return
     for g, trust_region in ((0.1, 20.0), (-0.1, 100.0), (0.02, 50.0), (5.0, 20.0)):
         given = function(g, trust_region)
@@ -492,10 +486,7 @@ def check_penalty_coefficient(function) -> None:
 
     function: (mean penalty p, value a of all entries of the reference) -> λ.
     """
-    if _waiting(function, "write a function (p, a) and hand it over."):
-        return
-    if not callable(function):
-        print("Not yet. Hand over the function itself, without calling it.")
+    if not _is_function(function, "write a function (p, a) and hand it over."):
         return
     for p, a in ((33.0, 0.0), (10.0, 0.0), (10.0, 0.5), (4.0, -1.0)):
         given = function(p, a)
@@ -586,10 +577,7 @@ def check_cem_generation(function) -> None:
     function: (designs [P, d], scores [P], CEMConfig) -> (mean [d], standard deviations [d]) of the
     next Gaussian.
     """
-    if _waiting(function, "write the function and hand it over."):
-        return
-    if not callable(function):
-        print("Not yet. Hand over the function itself, without calling it.")
+    if not _is_function(function, "write the function and hand it over."):
         return
     from shapebody.search.populations import CEMConfig
 
@@ -709,10 +697,7 @@ def check_pair_distance(function) -> None:
 
     function: (designs [S, d], S >= 2) -> one number.
     """
-    if _waiting(function, "write the function and hand it over."):
-        return
-    if not callable(function):
-        print("Not yet. Hand over the function itself, without calling it.")
+    if not _is_function(function, "write the function and hand it over."):
         return
     from itertools import combinations
 
@@ -753,10 +738,7 @@ def check_covered(function, trajectory) -> None:
     function: (trajectory [N + 1, d] of one start) -> n, the first with
     |f_n - f_N| <= 0.1 |f_0 - f_N|. trajectory: [N + 1, S, d] of a search, to say what it finds.
     """
-    if _waiting(function, "write the function and hand it over."):
-        return
-    if not callable(function):
-        print("Not yet. Hand over the function itself, without calling it.")
+    if not _is_function(function, "write the function and hand it over."):
         return
 
     def covered(path):
