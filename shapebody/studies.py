@@ -150,13 +150,19 @@ def _run_records(agent, robot, run: Run, short, starts, seed, **setting):
     records = _evaluated(agent, robot, run, found.design, seed=seed, **setting)
     last = len(found.trajectory) - 1
     rows = np.unique(np.linspace(0, last, CURVE_POINTS).round().astype(int))
+    # BO scores some designs before its first iteration.
+    before = found.settings.get("initial_points", 0)
+
+    def evaluations_until(row):
+        return 0 if row == 0 else before + round((found.evaluations - before) * row / last)
+
     objective = Objective.of(agent, robot, given)
     curves = np.stack([np.asarray(objective(found.trajectory[row])) for row in rows], 1)
     for record, curve in zip(records, curves, strict=True):
         record |= {
             "search_seconds": (found.seconds - found.compile_seconds) / len(initial),
             "evaluations": found.evaluations,
-            "curve_evaluations": [round(found.evaluations * row / last) for row in rows.tolist()],
+            "curve_evaluations": [evaluations_until(row) for row in rows.tolist()],
             "curve_objective": [round(float(value), 4) for value in curve],
         }
     return records
