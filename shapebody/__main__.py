@@ -35,7 +35,7 @@ def main(arguments=None) -> int:
         "sharpen", help="policy evaluation: a new critic for an agent's frozen policy"
     )
     sharpen.add_argument("agent")
-    sharpen.add_argument("--steps", type=int, default=4_000_000)
+    sharpen.add_argument("--steps", type=int, default=1_500_000)
     sharpen.add_argument("--hours", type=float)
 
     design = commands.add_parser("design", help="search for a better body")

@@ -768,7 +768,7 @@ def _begin_annealing(folder: Path, copy: Path, steps: int, last_rate: float) -> 
 def train_critic(
     agent: Agent,
     critic: CriticConfig,
-    steps: int = 4_000_000,
+    steps: int = 1_500_000,
     folder=None,
     progress: bool = True,
     max_seconds: float | None = None,
@@ -777,8 +777,10 @@ def train_critic(
 ) -> Agent:
     """Policy evaluation: train a new critic for a frozen policy over the full design space.
 
-    The agent's policy acts (with its exploration noise) on designs f ~ U([-1, 1]^d); the critic
-    learns its TD(lambda) returns.
+    The agent's policy acts (with its exploration noise) on designs at every distance from the
+    reference, f ~ U([-r, r]^d) with r ~ U(0, 1); the critic learns its TD(lambda) returns. An
+    episode lasts 200 control steps at most, since what a critic has to learn here is the design: it
+    sees five times as many as with whole episodes, and the value of what follows is bootstrapped.
 
     Args:
         agent: its policy is kept, its critic and state bank are replaced.
@@ -812,6 +814,7 @@ def train_critic(
             "num_envs": base.batch // length,
             "rollout_length": length,
             "total_steps": steps,
+            "task": replace(base.task, horizon=200, design_radius=(0.0, 1.0)),
             **changes,
         },
     )
@@ -881,6 +884,8 @@ def _continued(path: Path, config: TrainConfig, steps: int, robots=()) -> list[d
     try:
         phases = json.loads(path.read_text())
         before = phases[-1]["config"]
+        # Settings that are newer than the run are at their defaults in it.
+        before = _plain(_from_plain(TrainConfig, before))
     except (OSError, ValueError, LookupError, TypeError) as error:
         raise ValueError(
             f"{path.name} is missing or damaged ({error}); it says how the run in "

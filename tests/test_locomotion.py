@@ -329,3 +329,23 @@ def test_other_settings_share_what_starts_episodes(go2):
     assert fixed.groups is env.groups and not env.config.fixed_coefficient
     with pytest.raises(ValueError, match="initial_tilt is 0.5 instead of"):
         env.with_task(replace(env.config, initial_tilt=0.5))
+
+
+def test_designs_at_every_distance(go2):
+    """Root mean square of a design: 1 / sqrt(3) times its radius, which is uniform."""
+
+    def sizes(radius, c):
+        config = TaskConfig(**QUIET, design_radius=radius)
+        env = Locomotion(go2, 64, config=config, threads=1, engine="native")
+        designs = np.asarray(env.reset(jax.random.PRNGKey(0), coefficient=c).design)
+        return designs, np.sqrt(3 * np.mean(designs**2, -1)) / c
+
+    far, size = sizes((1.0, 1.0), 0.5)
+    assert np.abs(size - 1).max() < 0.15 and np.abs(far).max() <= 0.5
+    any_distance, size = sizes((0, 1), 0.5)
+    assert size.min() < 0.15 and size.max() > 0.85 and abs(size.mean() - 0.5) < 0.12
+    # The radius scales the designs that would be drawn without it.
+    np.testing.assert_allclose(any_distance / size[:, None], far, atol=0.08)
+    for wrong in [(0.5, 0.2), (-0.1, 1.0), (0.0, 2.0)]:
+        with pytest.raises(ValueError, match="design_radius"):
+            TaskConfig(design_radius=wrong)

@@ -119,6 +119,11 @@ def test_a_run_continues_only_with_its_own_configuration(config, tmp_path):
     longer.save()
     assert ppo.as_continued(config, tmp_path).epochs == 1
     assert ppo.as_continued(config, tmp_path / "nothing") == config
+    # A run that is older than a setting goes on with the setting's default.
+    for phase in longer.phases:
+        del phase["config"]["task"]["design_radius"]
+    longer.save()
+    assert longer.start()
     longer.phases[0]["robots"]["unitree_go2"] = "another file"
     longer.save()
     with pytest.raises(ValueError, match="file of robot unitree_go2 has changed"):

@@ -73,6 +73,10 @@ class TaskConfig:
     termination_height: float = 0.8
     """An episode ends below (1 - c) x this x the nominal IMU height."""
 
+    design_radius: tuple[float, float] = (1.0, 1.0)
+    """A design is drawn from U([-rc, rc]^d), with r uniform between these two. With (0, 1), bodies
+    lie at every distance from the reference; with r = 1, hardly any is near it in many dimensions.
+    """
     fixed_coefficient: bool = False
     """Keep c as it was at the reset, whatever happens: for frozen policies."""
     curriculum_levels: int = 100
@@ -86,6 +90,12 @@ class TaskConfig:
         if self.action_delay not in (None, 0, 1):
             raise ValueError(
                 f"action_delay is {self.action_delay!r}; expected 0, 1 or None (random per episode)"
+            )
+        low, high = (float(r) for r in self.design_radius)
+        object.__setattr__(self, "design_radius", (low, high))
+        if not 0 <= low <= high <= 1:
+            raise ValueError(
+                f"design_radius is {self.design_radius}; expected two numbers, 0 <= low <= high <= 1"
             )
         if self.horizon < 1:
             raise ValueError(f"horizon is {self.horizon}; expected at least one control step")

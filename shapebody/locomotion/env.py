@@ -249,7 +249,9 @@ class Locomotion:
         coefficients = jnp.full(n, coefficient, jnp.float32)
         streaks = jnp.zeros(n, jnp.int32)
         if designs is None:
-            designs = np.asarray(_draw_designs(keys, coefficients, self.design_dim))
+            designs = np.asarray(
+                _draw_designs(keys, coefficients, self.design_dim, self.config.design_radius)
+            )
         else:
             designs = np.asarray(designs, np.float32)
             designs = np.broadcast_to(designs, (n, designs.shape[-1]))
@@ -327,7 +329,10 @@ class Locomotion:
             # Unused slots repeat the first one.
             rows = np.concatenate([np.arange(at, at + m), np.full(RESET_SLOTS - m, at)])
             k, c = keys[rows], coefficients[rows]
-            f = _draw_designs(k, c, group.space.dim) if designs is None else designs[rows]
+            if designs is None:
+                f = _draw_designs(k, c, group.space.dim, self.config.design_radius)
+            else:
+                f = designs[rows]
             state, embodiment, qpos, qvel = group.jitted_start(k, f, c, streaks[rows])
             state, embodiment, qpos, qvel = jax.tree.map(
                 lambda x, m=m: np.asarray(x)[:m], (state, embodiment, qpos, qvel)
@@ -498,7 +503,8 @@ class Locomotion:
         fresh, restarted = [], []
         for group, one in zip(self.groups, physics, strict=True):
             s = group.slice
-            designs = _draw_designs(keys[s], coefficient[s], group.space.dim)
+            radius = self.config.design_radius
+            designs = _draw_designs(keys[s], coefficient[s], group.space.dim, radius)
             new, embodiment, qpos, qvel = group.start(keys[s], designs, coefficient[s], streak[s])
             fresh.append(new)
             restarted.append(group.physics.reset(one, done[s], embodiment, qpos, qvel))
@@ -556,11 +562,14 @@ def _next_key(keys):
     return jax.vmap(lambda key: jax.random.fold_in(key, 2**31 - 1))(keys)
 
 
-@partial(jax.jit, static_argnums=2)
-def _draw_designs(keys, coefficients, dim: int):
-    """f ~ U([-c, c]^d), one per key (Section 3.1)."""
+@partial(jax.jit, static_argnums=(2, 3))
+def _draw_designs(keys, coefficients, dim: int, radius: tuple[float, float]):
+    """f ~ U([-rc, rc]^d), one per key (Section 3.1), with r uniform between `radius`."""
 
     def draw(key, c):
-        return jax.random.uniform(jax.random.fold_in(key, 7), (dim,), minval=-1.0, maxval=1.0) * c
+        design = jax.random.uniform(jax.random.fold_in(key, 7), (dim,), minval=-1.0, maxval=1.0)
+        low, high = radius
+        r = jax.random.uniform(jax.random.fold_in(key, 8), minval=low, maxval=high)
+        return design * (c * r)
 
     return jax.vmap(draw)(keys, coefficients)
