@@ -95,7 +95,7 @@ class TaskConfig:
         object.__setattr__(self, "design_radius", (low, high))
         if not 0 <= low <= high <= 1:
             raise ValueError(
-                f"design_radius is {self.design_radius}; expected two numbers, 0 <= low <= high <= 1"
+                f"design_radius is {self.design_radius}; expected 0 <= low <= high <= 1"
             )
         if self.horizon < 1:
             raise ValueError(f"horizon is {self.horizon}; expected at least one control step")
