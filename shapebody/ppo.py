@@ -627,7 +627,7 @@ class Trainer:
         report.end()
 
     def state_bank(self, rollouts: int = 8):
-        """States from rollouts of the policy over the full design space (Section 3.2).
+        """States from rollouts of the policy on random designs at c = 1 (Section 3.2).
 
         Returns (Observation [M, ...] of numpy arrays, robot index int32[M]).
         """
