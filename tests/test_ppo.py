@@ -254,7 +254,9 @@ def test_train_and_policy_evaluation(config, tmp_path):
     for a, b in zip(jax.tree.leaves(agent.policy), jax.tree.leaves(sharper.policy), strict=True):
         np.testing.assert_array_equal(a, b)
     assert sharper.critic_config.heads == 3 and sharper.metadata["steps"] == 128
-    assert sharper.metadata["policy_evaluation"]["steps"] == 256
+    phase = sharper.metadata["policy_evaluation"]
+    assert phase["steps"] == 256
+    assert phase["config"]["task"]["design_radius"] == [0.0, 1.0]
     assert np.all(np.asarray(sharper.states.privileged)[:, 4] == 1.0)
 
 
