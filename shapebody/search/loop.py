@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import numbers
+import os
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -48,43 +50,51 @@ def iterate(objective, starts, key, config, steps: Steps, evaluations: int) -> S
 
     Every iteration draws a new minibatch of states, the same as VGDS with that key and the same
     for all starts. A start's own random numbers follow from the key and the start design, so that
-    its result does not depend on the other starts. One compiled program for all starts.
+    its result does not depend on the other starts, to the last bit: each is searched by the same
+    program, as many at a time as there are cores.
     """
-    return Search(*_run(objective, jnp.asarray(starts), key, config, steps), evaluations)
+    starts = jnp.asarray(starts)
+    # Compiled here, once; threads that meet an uncompiled function would each compile it.
+    run = _run.lower(objective, starts[0], key, config, steps).compile()
+    # A population alone keeps two cores busy for little more than half of the time.
+    with ThreadPoolExecutor(_cores()) as pool:
+        found = pool.map(lambda start: jax.block_until_ready(run(objective, start, key)), starts)
+        trajectory, history = (jnp.stack(values, axis=1) for values in zip(*found, strict=True))
+    return Search(last_finite(trajectory, history), trajectory, history, evaluations)
+
+
+def _cores() -> int:
+    """Number of processor cores that this process may use."""
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
 
 
 @partial(jax.jit, static_argnames=("config", "steps"))
-def _run(objective, starts, key, config, steps: Steps):
+def _run(objective, start, key, config, steps: Steps):
+    """Trajectory [N + 1, d] and history [N + 1] of one start [d]."""
     batch_keys = jax.random.split(key, config.iterations + 1)
+    begin_key, *_ = iteration_keys = jax.random.split(start_key(key, start), len(batch_keys))
 
-    def search(start):
-        begin_key, *_ = iteration_keys = jax.random.split(start_key(key, start), len(batch_keys))
+    def iteration(memory, keys):
+        batch_key, own_key = keys
+        propose_key, update_key = jax.random.split(own_key)
+        designs = steps.propose(config, memory, propose_key)
+        rows = jnp.concatenate([memory.design[None], designs])
+        states = objective.batch(batch_key)
+        if steps.gradients:
+            values, gradients = values_and_gradients(objective, rows, states)
+            gradients = gradients[1:]
+        else:
+            values, gradients = objective(rows, states), None
+        scored = Scored(designs, values[1:], gradients, values[0])
+        return steps.update(config, memory, scored, update_key), (memory.design, values[0])
 
-        def iteration(memory, keys):
-            batch_key, own_key = keys
-            propose_key, update_key = jax.random.split(own_key)
-            designs = steps.propose(config, memory, propose_key)
-            rows = jnp.concatenate([memory.design[None], designs])
-            states = objective.batch(batch_key)
-            if steps.gradients:
-                values, gradients = values_and_gradients(objective, rows, states)
-                gradients = gradients[1:]
-            else:
-                values, gradients = objective(rows, states), None
-            scored = Scored(designs, values[1:], gradients, values[0])
-            return steps.update(config, memory, scored, update_key), (memory.design, values[0])
-
-        memory = steps.begin(config, start, begin_key)
-        keys = (batch_keys[:-1], iteration_keys[1:])
-        memory, (trajectory, history) = jax.lax.scan(iteration, memory, keys)
-        last = objective(memory.design[None], objective.batch(batch_keys[-1]))
-        return jnp.concatenate([trajectory, memory.design[None]]), jnp.append(history, last)
-
-    # One start after the other: a population fills the cores already, and the arithmetic of a
-    # start is the same in any company, to the last bit.
-    trajectory, history = jax.lax.map(search, starts)
-    trajectory, history = jnp.swapaxes(trajectory, 0, 1), history.T
-    return last_finite(trajectory, history), trajectory, history
+    memory = steps.begin(config, start, begin_key)
+    keys = (batch_keys[:-1], iteration_keys[1:])
+    memory, (trajectory, history) = jax.lax.scan(iteration, memory, keys)
+    last = objective(memory.design[None], objective.batch(batch_keys[-1]))
+    return jnp.concatenate([trajectory, memory.design[None]]), jnp.append(history, last)
 
 
 def values_and_gradients(objective, designs, states):
