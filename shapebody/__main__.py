@@ -35,8 +35,8 @@ def main(arguments=None) -> int:
         "sharpen", help="policy evaluation: a new critic for an agent's frozen policy"
     )
     sharpen.add_argument("agent")
-    sharpen.add_argument("--steps", type=int, default=1_500_000)
-    sharpen.add_argument("--hours", type=float)
+    sharpen.add_argument("--steps", type=int, help="3 %% of those of training if not given")
+    sharpen.add_argument("--hours", type=float, help="stop after this time; run again to continue")
 
     design = commands.add_parser("design", help="search for a better body")
     design.add_argument("robot", help="name in data/robots, or an MJCF file")
@@ -114,8 +114,11 @@ def _sharpen(options):
     from shapebody.ppo import train_critic
 
     agent = load_agent(options.agent)
+    critic = CriticConfig() if agent.metadata["scale"] == "full" else CriticConfig.sharp()
     seconds = None if options.hours is None else 3600 * options.hours
-    train_critic(agent, CriticConfig.sharp(), options.steps, max_seconds=seconds)
+    sharper = train_critic(agent, critic, options.steps, max_seconds=seconds)
+    if sharper is agent:
+        print("not finished: the agent is as it was, the same command continues")
 
 
 def _design(options):

@@ -117,6 +117,11 @@ class Agent:
         """SHA-256 of the weights of policy and critic, hexadecimal."""
         return _hash(_flat_weights(self))
 
+    @functools.cached_property
+    def policy_hash(self) -> str:
+        """SHA-256 of the policy's weights alone, hexadecimal."""
+        return _hash({k: v for k, v in _flat_weights(self).items() if k.startswith("policy")})
+
     @property
     def states_hash(self) -> str | None:
         """SHA-256 of the state bank; None without one."""

@@ -718,14 +718,12 @@ def anneal(
         The agent; None if the copy was stopped before its end, which leaves the old agent.
 
     Raises:
-        ValueError: if there is no such run, or its files are damaged.
+        ValueError: if there is no such run, its files are damaged, or the copy that was stopped is
+            of another step of the run or has other settings.
     """
     folder = Path(folder) if folder else data_dir() / "checkpoints" / name
     copy = folder / "annealed"
-    if not (copy / "training.safetensors").exists():
-        _begin_annealing(folder, copy, steps, last_rate)
-    saved = json.loads((copy / "training.json").read_text())[-1]["config"]
-    config = _from_plain(TrainConfig, saved)
+    config = _begin_annealing(folder, copy, steps, last_rate)
     trainer = Trainer(config, copy, engine)
     trainer.start()
     _run(trainer, progress, None, max_seconds)
@@ -736,8 +734,11 @@ def anneal(
     return agent
 
 
-def _begin_annealing(folder: Path, copy: Path, steps: int, last_rate: float) -> None:
-    """Copy a run's files, with a new phase: `steps` more, and a rate that falls to `last_rate`."""
+def _begin_annealing(folder: Path, copy: Path, steps: int, last_rate: float) -> TrainConfig:
+    """Copy a run's files, with a new phase: `steps` more, and a rate that falls to `last_rate`.
+
+    A copy that is there already stays. Returns the configuration of the new phase.
+    """
     missing = [file for file in STATE_FILES if not (folder / file).exists()]
     if missing:
         raise ValueError(f"there is no run to anneal in {folder.name}: {missing[0]} is missing")
@@ -759,69 +760,83 @@ def _begin_annealing(folder: Path, copy: Path, steps: int, last_rate: float) -> 
         "learning_rate": [rate - slope * done, last_rate],
     }
     phases.append({"from_step": done * batch, "config": config})
-    atomic_write(copy / "training.json", json.dumps(phases, indent=1) + "\n")
-    atomic_write(copy / "training.csv", (folder / "training.csv").read_text())
-    # The state comes last: a copy without it is made again.
-    atomic_write(copy / "training.safetensors", state)
+    if (copy / "training.safetensors").exists():
+        if json.loads((copy / "training.json").read_text()) != phases:
+            raise ValueError(
+                f"{copy} is from an annealing that was stopped, of another step of the run or with "
+                "other steps or rate; delete that folder to begin anew"
+            )
+    else:
+        atomic_write(copy / "training.json", json.dumps(phases, indent=1) + "\n")
+        atomic_write(copy / "training.csv", (folder / "training.csv").read_text())
+        # The state comes last: a copy without it is made again.
+        atomic_write(copy / "training.safetensors", state)
+    return _from_plain(TrainConfig, config)
 
 
 def train_critic(
     agent: Agent,
     critic: CriticConfig,
-    steps: int = 1_500_000,
+    steps: int | None = None,
     folder=None,
     progress: bool = True,
     max_seconds: float | None = None,
     engine: str = "auto",
     **changes,
 ) -> Agent:
-    """Policy evaluation: train a new critic for a frozen policy over the full design space.
+    """Policy evaluation: train a new critic for a frozen policy, at all distances from f = 0.
 
-    The agent's policy acts (with its exploration noise) on designs at every distance from the
-    reference, f ~ U([-r, r]^d) with r ~ U(0, 1); the critic learns its TD(lambda) returns. An
-    episode lasts 200 control steps at most, since what a critic has to learn here is the design: it
-    sees five times as many as with whole episodes, and the value of what follows is bootstrapped.
+    The agent's policy acts (with its exploration noise) on designs f ~ U([-r, r]^d) with
+    r ~ U(0, 1); the critic learns its TD(lambda) returns. An episode lasts 200 control steps at
+    most, since what a critic has to learn here is the design: it sees more of them than with whole
+    episodes, and the value of what follows is bootstrapped.
 
     Args:
         agent: its policy is kept, its critic and state bank are replaced.
         critic: sizes of the new critic.
-        steps: environment steps.
+        steps: environment steps; 3 % of those that training takes at the agent's scale if not
+            given, 1.5 million at `reduced`.
         folder: where the new agent is saved; data/checkpoints/<agent> by default, which replaces
             the old critic there. The phase's own state and curve are in a folder in it.
-        progress, max_seconds, engine: see `train`. A run that was stopped is continued.
+        progress, max_seconds, engine: see `train`. A phase that was stopped is continued.
         changes: replace fields of the TrainConfig; by default gae_lambda is 0.95, and rollouts
             have at least 32 steps.
 
     Returns:
         The agent with the new critic and a new state bank. Its metadata are those of the policy's
-        training, with those of this phase under "policy_evaluation".
+        training, with those of this phase under "policy_evaluation". If the phase was stopped
+        before its end, `agent` itself, and nothing in the folder is replaced.
     """
     folder = Path(folder) if folder else data_dir() / "checkpoints" / agent.name
-    # Robots by the names or files they were trained from.
-    robots = tuple(agent.metadata["config"]["robots"])
-    base = TrainConfig.at_scale(agent.metadata["scale"], robots[0], name=agent.name)
+    trained = _from_plain(TrainConfig, agent.metadata["config"])
+    base = TrainConfig.at_scale(agent.metadata["scale"], trained.robots[0], name=agent.name)
     length = max(base.rollout_length, 32)
     config = replace(
         base,
         **{
-            "robots": robots,
+            # Robots by the names or files they were trained from.
+            "robots": trained.robots,
+            "seed": trained.seed,
             "policy": agent.policy_config,
             "critic": critic,
             "standardize": True,
             "learn_policy": False,
+            "discount": trained.discount,
             "gae_lambda": 0.95,
             # Returns with that λ look further ahead than short rollouts reach.
             "num_envs": base.batch // length,
             "rollout_length": length,
-            "total_steps": steps,
-            "task": replace(base.task, horizon=200, design_radius=(0.0, 1.0)),
+            "total_steps": base.total_steps * 3 // 100 if steps is None else steps,
+            "task": replace(trained.task, horizon=200, design_radius=(0.0, 1.0)),
             **changes,
         },
     )
     # The state belongs to this policy: another one starts anew.
-    trainer = Trainer(config, folder / f"critic_{agent.hash[:8]}", engine, policy=agent.policy)
+    trainer = Trainer(config, folder / f"critic_{agent.policy_hash[:8]}", engine, agent.policy)
     trainer.start()
     _run(trainer, progress, None, max_seconds)
+    if trainer.steps < config.iterations * config.batch:
+        return agent
     sharper = trainer.agent(trainer.state_bank())
     phase = {name: sharper.metadata[name] for name in ("config", "steps", "seconds")}
     sharper = replace(sharper, metadata={**agent.metadata, "policy_evaluation": phase})
@@ -883,13 +898,20 @@ def _continued(path: Path, config: TrainConfig, steps: int, robots=()) -> list[d
     """
     try:
         phases = json.loads(path.read_text())
-        before = phases[-1]["config"]
-        # Settings that are newer than the run are at their defaults in it.
-        before = _plain(_from_plain(TrainConfig, before))
+        before = dict(phases[-1]["config"])
     except (OSError, ValueError, LookupError, TypeError) as error:
         raise ValueError(
             f"{path.name} is missing or damaged ({error}); it says how the run in "
             f"{path.parent.name} was configured: restore it, or start anew in another folder"
+        ) from error
+    try:
+        # Settings that are newer than the run are at their defaults in it.
+        before = _plain(_from_plain(TrainConfig, before))
+    except TypeError as error:
+        raise ValueError(
+            f"{path.name} of the run in {path.parent.name} has settings that this version of "
+            f"shapebody does not know ({error}); continue it with the version that began it, or "
+            "start anew in another folder"
         ) from error
     now = _plain(config)
     different = [name for name in now if before.get(name) != now[name]]
@@ -898,7 +920,7 @@ def _continued(path: Path, config: TrainConfig, steps: int, robots=()) -> list[d
         text = "; ".join(f"{name} was {before.get(name)!r}, is {now[name]!r}" for name in other)
         raise ValueError(
             f"the run in {path.parent.name} has another configuration ({text}); continue it with "
-            "the old one, or choose another name"
+            f"the old one, choose another name, or delete {path.parent} to begin anew"
         )
     known = phases[0].get("robots", {})
     changed = [r.name for r in robots if known.get(r.name, _robot_hash(r)) != _robot_hash(r)]

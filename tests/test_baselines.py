@@ -171,6 +171,10 @@ def test_a_start_does_not_depend_on_its_company(name):
     together = run(name, objective, starts, **SMALL[name])
     turned = run(name, objective, starts[::-1], **SMALL[name])
     alone = run(name, objective, starts[1:2], **SMALL[name])
+    if name in ("random", "turbo", "pso", "cem", "de", "ars", "gc-pfo"):  # one program per start
+        np.testing.assert_array_equal(turned.trajectory[:, ::-1], together.trajectory)
+        np.testing.assert_array_equal(alone.trajectory[:, 0], together.trajectory[:, 1])
+        np.testing.assert_array_equal(alone.history[:, 0], together.history[:, 1])
     np.testing.assert_allclose(turned.trajectory[:, ::-1], together.trajectory, atol=1e-6)
     np.testing.assert_allclose(alone.trajectory[:, 0], together.trajectory[:, 1], atol=1e-6)
     np.testing.assert_allclose(alone.history[:, 0], together.history[:, 1], atol=1e-5)

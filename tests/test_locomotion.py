@@ -331,6 +331,19 @@ def test_other_settings_share_what_starts_episodes(go2):
         env.with_task(replace(env.config, initial_tilt=0.5))
 
 
+@pytest.mark.parametrize("engine", ["native", "mjx"])
+def test_restarted_episodes_have_designs_at_every_distance(go2, engine):
+    changes = dict(horizon=2, design_radius=(0, 1), fixed_coefficient=True)
+    env = Locomotion(go2, 64, config=TaskConfig(**QUIET, **changes), engine=engine)
+    first = env.reset(jax.random.PRNGKey(0), coefficient=0.5)
+    before = np.array(first.design)
+    state, _ = env.rollout(wave, None, first, jax.random.PRNGKey(0), 3)
+    designs = np.asarray(state.design)
+    assert not np.any(np.all(designs == before, axis=-1))
+    size = 2 * np.sqrt(3 * np.mean(designs**2, -1))
+    assert size.min() < 0.15 and size.max() > 0.85 and abs(size.mean() - 0.5) < 0.12
+
+
 def test_designs_at_every_distance(go2):
     """Root mean square of a design: 1 / sqrt(3) times its radius, which is uniform."""
 
@@ -346,6 +359,6 @@ def test_designs_at_every_distance(go2):
     assert size.min() < 0.15 and size.max() > 0.85 and abs(size.mean() - 0.5) < 0.12
     # The radius scales the designs that would be drawn without it.
     np.testing.assert_allclose(any_distance / size[:, None], far, atol=0.08)
-    for wrong in [(0.5, 0.2), (-0.1, 1.0), (0.0, 2.0)]:
+    for wrong in [(0.5, 0.2), (-0.1, 1.0), (0.0, 2.0), (0.0, np.nan), 0.5, (0.5,), None]:
         with pytest.raises(ValueError, match="design_radius"):
             TaskConfig(design_radius=wrong)

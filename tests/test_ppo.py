@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from shapebody import ppo
-from shapebody.checkpoints import load_agent, load_curve
+from shapebody.checkpoints import load_agent, load_curve, save_agent
 from shapebody.networks import CriticConfig
 
 
@@ -151,6 +151,8 @@ def test_annealing_leaves_the_run_as_it_is(config, tmp_path, monkeypatch):
     # A time limit stops it early; the same call goes on with what is left.
     arguments = dict(steps=steps, last_rate=last_rate, folder=tmp_path, progress=False)
     assert ppo.anneal("walker", max_seconds=0.0, **arguments) is None
+    with pytest.raises(ValueError, match="delete that folder to begin anew"):
+        ppo.anneal("walker", **arguments | {"steps": 2 * config.batch})
     assert not (tmp_path / "agent.json").exists()
     agent = ppo.anneal("walker", **arguments)
     assert agent.metadata["steps"] == 5 * config.batch
@@ -250,13 +252,24 @@ def test_train_and_policy_evaluation(config, tmp_path):
     small = CriticConfig.reduced(
         joint_key_widths=(8, 8), foot_key_widths=(8, 8), head_widths=(8,), heads=3
     )
-    sharper = ppo.train_critic(loaded, small, steps=256, folder=tmp_path / "b", progress=False)
+    # A phase that is stopped leaves the agent as it is; the same call goes on with it.
+    arguments = dict(steps=256, folder=tmp_path / "b", progress=False)
+    save_agent(loaded, tmp_path / "b")
+    assert ppo.train_critic(loaded, small, max_seconds=0.0, **arguments) is loaded
+    assert load_agent(tmp_path / "b").hash == loaded.hash
+    sharper = ppo.train_critic(loaded, small, **arguments)
+    assert len(list((tmp_path / "b").glob("critic_*"))) == 1
+    assert load_agent(tmp_path / "b").hash == sharper.hash != loaded.hash
+    assert sharper.policy_hash == loaded.policy_hash
+    again = ppo.train_critic(sharper, small, **arguments)
+    assert again.hash == sharper.hash
     for a, b in zip(jax.tree.leaves(agent.policy), jax.tree.leaves(sharper.policy), strict=True):
         np.testing.assert_array_equal(a, b)
     assert sharper.critic_config.heads == 3 and sharper.metadata["steps"] == 128
     phase = sharper.metadata["policy_evaluation"]
     assert phase["steps"] == 256
     assert phase["config"]["task"]["design_radius"] == [0.0, 1.0]
+    assert phase["config"]["task"]["horizon"] == 200
     assert np.all(np.asarray(sharper.states.privileged)[:, 4] == 1.0)
 
 

@@ -6,7 +6,7 @@ environment.
 """
 
 from dataclasses import dataclass
-from math import pi
+from math import nan, pi
 
 CONTROL_STEP = 0.02
 """Seconds per control step (50 Hz); physics runs four substeps of 5 ms inside it."""
@@ -91,12 +91,16 @@ class TaskConfig:
             raise ValueError(
                 f"action_delay is {self.action_delay!r}; expected 0, 1 or None (random per episode)"
             )
-        low, high = (float(r) for r in self.design_radius)
-        object.__setattr__(self, "design_radius", (low, high))
+        try:
+            low, high = (float(r) for r in self.design_radius)
+        except (TypeError, ValueError):
+            low, high = nan, nan
         if not 0 <= low <= high <= 1:
             raise ValueError(
-                f"design_radius is {self.design_radius}; expected 0 <= low <= high <= 1"
+                f"design_radius is {self.design_radius!r}; expected two numbers (low, high) with "
+                "0 <= low <= high <= 1"
             )
+        object.__setattr__(self, "design_radius", (low, high))
         if self.horizon < 1:
             raise ValueError(f"horizon is {self.horizon}; expected at least one control step")
 

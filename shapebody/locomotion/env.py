@@ -237,7 +237,7 @@ class Locomotion:
         Args:
             key: PRNG key.
             designs: normalized designs, one [d] or one per environment [N, d] (padded to
-                the largest robot's d); None draws them from U(-c, c).
+                the largest robot's d); None draws them from U(-rc, rc) (`design_radius`).
             coefficient: curriculum coefficient c in [0, 1] of every environment.
             spread: cut the first episodes at random horizons, so that episodes do not all
                 end in the same step.
@@ -351,7 +351,7 @@ class Locomotion:
             state: from `reset`, `step` or `rollout`.
             rows: [R] numbers of the environments, ascending.
             keys: [R] one key per new episode.
-            designs: [R, d], padded to the largest robot's d; None draws them from U(-c, c).
+            designs: [R, d], padded to the largest robot's d; None draws them as `reset` does.
             coefficient: c of the new episodes, one number or [R]; `streak` likewise.
 
         Returns:

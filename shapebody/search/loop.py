@@ -51,13 +51,14 @@ def iterate(objective, starts, key, config, steps: Steps, evaluations: int) -> S
     Every iteration draws a new minibatch of states, the same as VGDS with that key and the same
     for all starts. A start's own random numbers follow from the key and the start design, so that
     its result does not depend on the other starts, to the last bit: each is searched by the same
-    program, as many at a time as there are cores.
+    program, on a CPU as many at a time as there are cores.
     """
     starts = jnp.asarray(starts)
     # Compiled here, once; threads that meet an uncompiled function would each compile it.
     run = _run.lower(objective, starts[0], key, config, steps).compile()
-    # A population alone keeps two cores busy for little more than half of the time.
-    with ThreadPoolExecutor(_cores()) as pool:
+    # One population keeps two cores busy for little more than half of the time.
+    side_by_side = _cores() if jax.default_backend() == "cpu" else 1
+    with ThreadPoolExecutor(side_by_side) as pool:
         found = pool.map(lambda start: jax.block_until_ready(run(objective, start, key)), starts)
         trajectory, history = (jnp.stack(values, axis=1) for values in zip(*found, strict=True))
     return Search(last_finite(trajectory, history), trajectory, history, evaluations)

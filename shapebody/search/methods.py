@@ -71,7 +71,8 @@ class SearchResult:
             scores that only fill `history` are not counted.
         seconds: wall time of the search for all starts, compilation included.
         compile_seconds: the part of it that went into compilation; 0 when a search of the same
-            kind (method, settings, robot, number of starts, size of the critic) ran before.
+            kind (method, settings, robot, size of the critic; VGDS also: number of starts) ran
+            before.
         method: name of the method.
         settings: all settings, including trust_region, seed, batch_size and the agent's hash.
     """
