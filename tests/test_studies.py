@@ -1,15 +1,19 @@
 """Design studies: searches, their evaluation, and the file that keeps both."""
 
 import json
+from pathlib import Path
 
 import numpy as np
 import pytest
 from tiny import quick_compilation, tiny_agent, tiny_robot
 
-from shapebody import paper, studies
+from shapebody import experiments, paper, studies
+from shapebody.checkpoints import load_agent
 from shapebody.design import DesignSpace
 from shapebody.evaluation import EvaluationConfig, evaluate
 from shapebody.locomotion import TaskConfig
+from shapebody.paths import data_dir
+from shapebody.robots import load_robot
 from shapebody.search import METHODS, Objective, search
 from shapebody.studies import CONTROL, Run, design_study
 
@@ -122,3 +126,30 @@ def test_available_runs_are_installed_or_stored(results, agent, robot, monkeypat
         assert studies.available(agent, robot, runs, **other) == (CONTROL, runs[2])
     monkeypatch.setenv("SHAPEBODY_SCALE", "smoke")
     assert studies.available(agent, robot, runs, **SETTING) == (CONTROL, runs[2])
+
+
+def test_readme_states_the_stored_results():
+    """The table of agents, row by row, from data/results."""
+    readme = (Path(__file__).parents[1] / "README.md").read_text()
+    for name in experiments.trained_robots(paper.ROBOTS):
+        robot, agent = load_robot(name), load_agent(name)
+        path = data_dir() / "results" / f"design_study_{name}.json"
+        parts = json.loads(path.read_text())["parts"].values()
+        records = [record for part in parts for record in part["records"]]
+        before = {
+            origin: np.mean(
+                [r["return"] for r in records if (r["method"], r["origin"]) == ("none", origin)]
+            )
+            for origin in ("reference", "start")
+        }
+        gains = studies.gains(records)
+        total, added = (
+            studies.gain(gains, "vgds", over, 100.0) for over in ("start", "penalty-only")
+        )
+        row = (
+            f"| {robot.display_name} | {agent.metadata['steps'] / 1e6:.1f} million "
+            f"| {before['reference']:.1f} | {before['start']:.1f} "
+            f"| {paper.SINGLE_ROBOT[name]['VGDS']:+.1f} | {total['mean']:+.1f} "
+            f"| {added['mean']:+.1f} [{added['low']:+.1f}, {added['high']:+.1f}] |"
+        )
+        assert row in readme, f"README.md should have: {row}"
