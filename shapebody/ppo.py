@@ -920,7 +920,7 @@ def _continued(path: Path, config: TrainConfig, steps: int, robots=()) -> list[d
         text = "; ".join(f"{name} was {before.get(name)!r}, is {now[name]!r}" for name in other)
         raise ValueError(
             f"the run in {path.parent.name} has another configuration ({text}); continue it with "
-            f"the old one, choose another name, or delete {path.parent} to begin anew"
+            "the old one, choose another name, or delete its training.safetensors to begin anew"
         )
     known = phases[0].get("robots", {})
     changed = [r.name for r in robots if known.get(r.name, _robot_hash(r)) != _robot_hash(r)]
