@@ -129,7 +129,9 @@ class CriticConfig:
             dimension of the softmax.
         joint_value_latent, foot_value_latent: width of a part's value.
         head_widths: hidden widths of every head; the output layer of width 1 follows.
-        initial_temperature, minimum_temperature, latent_scale: see `PolicyConfig`.
+        initial_temperature, minimum_temperature, latent_scale: see `PolicyConfig`. A direct-design
+            critic's latent is large at 1.0 already, because its values are made of descriptions:
+            at 8.0 it hides the command beside it, and the critic learns slowly what that is worth.
 
     Raises:
         ValueError: if a value is out of range.
@@ -169,7 +171,6 @@ class CriticConfig:
             foot_value_latent=4,
             head_widths=(80, 64),
             initial_temperature=0.2,
-            latent_scale=8.0,
         )
         return cls(**(sizes | changes))
 

@@ -33,6 +33,7 @@ import optax
 from shapebody.checkpoints import Agent, atomic_write, load_arrays, save_agent, save_arrays
 from shapebody.files import read_safetensors
 from shapebody.locomotion import Locomotion, TaskConfig, Trajectory
+from shapebody.locomotion.observations import Observation
 from shapebody.networks import (
     Critic,
     CriticConfig,
@@ -75,6 +76,13 @@ class TrainConfig:
     """At the first and at the last step; linear between."""
     discount: float = 0.99
     gae_lambda: float = 0.7
+    value_lambda: float | None = None
+    """gae_lambda of the critic's targets, if not the same. With short rollouts and few gradient
+    steps, a small one makes the critic learn slowly what lasts longer than 1 / (1 - lambda) steps.
+    """
+    cut_at_commands: bool = False
+    """The policy's advantages end where the command changes, as if the episode were truncated. No
+    action causes that change, so what the new command is worth is only noise to the policy."""
     clip_range: float = 0.1
     entropy_coefficient: float = 0.005
     max_gradient_norm: float = 3.0
@@ -137,6 +145,8 @@ class TrainConfig:
                 "epochs": 3,
                 "total_steps": 50_000_000,
                 "learning_rate": (1e-3, 1e-4),
+                "value_lambda": 0.95,
+                "cut_at_commands": True,
                 **changes,
             }
         )
@@ -207,6 +217,16 @@ def advantages(reward, value, last_value, terminated, truncated, discount, gae_l
 
     _, result = jax.lax.scan(backward, jnp.zeros_like(last_value), (error.T, done.T), reverse=True)
     return result.T
+
+
+def command_changes(observation: Observation, last_observation: Observation):
+    """Whether the command of the next step is another one, bool[N, T].
+
+    observation: [N, T, ...]; last_observation: [N, ...], after the last step.
+    """
+    commands = observation.general[..., 3:6]
+    following = jnp.concatenate([commands[:, 1:], last_observation.general[:, None, 3:6]], 1)
+    return jnp.any(following != commands, -1)
 
 
 def make_policy_function(policy: Policy):
@@ -330,16 +350,19 @@ def make_update(config: TrainConfig, policy: Policy, critic: Critic):
         value = jnp.mean(_apply(critic, learner.critic, descriptions, slot, observation), -1)
         latest = jax.tree.map(lambda x: x[:, 1], descriptions)
         last_value = jnp.mean(critic.apply(learner.critic, latest, trajectory.last_observation), -1)
-        advantage = advantages(
-            reward,
-            value,
-            last_value,
-            by_env(trajectory.terminated),
-            by_env(trajectory.truncated),
-            config.discount,
-            config.gae_lambda,
-        )
-        target = advantage + value
+        terminated, truncated = by_env(trajectory.terminated), by_env(trajectory.truncated)
+
+        def estimate(truncated, gae_lambda):
+            return advantages(
+                reward, value, last_value, terminated, truncated, config.discount, gae_lambda
+            )
+
+        value_lambda = config.gae_lambda if config.value_lambda is None else config.value_lambda
+        target = estimate(truncated, value_lambda) + value
+        cut = truncated
+        if config.cut_at_commands:
+            cut |= command_changes(observation, trajectory.last_observation)
+        advantage = estimate(cut, config.gae_lambda)
         total = jnp.sum(valid)
 
         def moments(x):
@@ -823,6 +846,7 @@ def train_critic(
             "learn_policy": False,
             "discount": trained.discount,
             "gae_lambda": 0.95,
+            "value_lambda": None,
             # Returns with that λ look further ahead than short rollouts reach.
             "num_envs": base.batch // length,
             "rollout_length": length,
@@ -870,19 +894,32 @@ def _from_plain(kind, values: dict):
     return kind(**{name: value(hints.get(name), given) for name, given in values.items()})
 
 
-SCHEDULE = ("total_steps", "epochs", "minibatch_size", "learning_rate", "state_bank")
+SCHEDULE = (
+    "total_steps",
+    "epochs",
+    "minibatch_size",
+    "learning_rate",
+    "value_lambda",
+    "cut_at_commands",
+    "state_bank",
+)
 """Fields that may change when a run is continued; each change is recorded."""
 
 
 def as_continued(config: TrainConfig, folder=None) -> TrainConfig:
-    """`config` with the schedule of the run in its folder, if there is one to continue."""
+    """The configuration of the run in the folder of `config`, if there is one to continue.
+
+    `config` itself if there is none, or one of other robots or of another scale. So a run goes on
+    with the settings that it was begun with, whatever the defaults are now.
+    """
     folder = Path(folder) if folder else data_dir() / "checkpoints" / config.name
     try:
-        last = json.loads((folder / "training.json").read_text())[-1]["config"]
-    except (OSError, ValueError, LookupError, TypeError):
+        plain = json.loads((folder / "training.json").read_text())[-1]["config"]
+        last = _from_plain(TrainConfig, plain)
+    except (OSError, ValueError, LookupError, TypeError, AttributeError):
         return config  # nothing to continue, or a damaged file, which `Trainer.start` reports
-    schedule = {name: last.get(name, getattr(config, name)) for name in SCHEDULE}
-    return replace(config, **schedule | {"learning_rate": tuple(schedule["learning_rate"])})
+    same = (last.name, last.robots, last.scale) == (config.name, config.robots, config.scale)
+    return last if same else config
 
 
 def _robot_hash(robot) -> str:

@@ -9,6 +9,7 @@ import pytest
 
 from shapebody import ppo
 from shapebody.checkpoints import load_agent, load_curve, save_agent
+from shapebody.locomotion.observations import Observation
 from shapebody.networks import CriticConfig
 
 
@@ -34,6 +35,18 @@ def test_advantages_against_a_plain_loop():
                 reward[i, k] + discount * following - value[i, k] + (discount * lam * advantage)
             )
             assert got[i, k] == pytest.approx(advantage, rel=1e-4, abs=1e-5)
+
+
+def test_command_changes():
+    command = np.zeros((2, 4, 13), np.float32)
+    command[0, 2:, 4] = 0.5  # a new command in the third step
+    command[1, :, 0] = np.arange(4)  # angular velocity changes in every step
+    observation = Observation(joints=None, feet=None, general=command, privileged=None)
+    last = replace(observation, general=np.array(command[:, -1]))
+    changes = ppo.command_changes(observation, last)
+    np.testing.assert_array_equal(changes, [[False, True, False, False], [False] * 4])
+    last.general[1, 5] = -0.1  # a new yaw rate after the last step
+    assert ppo.command_changes(observation, last)[1].tolist() == [False, False, False, True]
 
 
 def test_configurations():
@@ -117,8 +130,11 @@ def test_a_run_continues_only_with_its_own_configuration(config, tmp_path):
     assert longer.start()
     assert [phase["from_step"] for phase in longer.phases] == [0, 128]
     longer.save()
-    assert ppo.as_continued(config, tmp_path).epochs == 1
+    # The run's own settings, whatever the defaults are now.
+    assert ppo.as_continued(replace(config, discount=0.9), tmp_path) == longer.config
     assert ppo.as_continued(config, tmp_path / "nothing") == config
+    other = replace(config, scale="full")
+    assert ppo.as_continued(other, tmp_path) == other
     # A run that is older than a setting goes on with the setting's default.
     for phase in longer.phases:
         del phase["config"]["task"]["design_radius"]
@@ -222,6 +238,41 @@ def test_update_follows_the_advantage(straight):
     for i in range(5):
         later, more = update(later, trajectory, jax.random.PRNGKey(4 + i))
     assert more["value_loss"] < metrics["value_loss"]
+
+
+def test_advantages_end_where_the_command_changes(straight):
+    """What a new command is worth reaches the critic's targets, but not the policy's advantages."""
+    _, trainer = straight
+    state = trainer.env.reset(jax.random.PRNGKey(1), coefficient=0.0)
+    learner, key = trainer.learner, jax.random.PRNGKey(2)
+    state, trajectory = trainer.env.rollout(trainer.act, learner.policy, state, key, 8)
+    general = np.array(trajectory.observation.general)
+    general[4:, :, 3:6] = general[:4, :, 3:6] + 0.5
+    after = replace(
+        trajectory,
+        observation=replace(trajectory.observation, general=general),
+        last_observation=replace(trajectory.last_observation, general=general[-1]),
+        reward=np.zeros_like(trajectory.reward),
+    )
+    # The policy learns from the steps before the change alone; rewards come after it.
+    early = np.arange(8)[:, None] < 4
+    after = replace(after, valid=np.asarray(after.valid) * early)
+    late = replace(after, reward=np.where(early, after.reward, np.float32(1)))
+
+    def learn(trajectory, **changes):
+        config = replace(trainer.config, epochs=1, entropy_coefficient=0.0, **changes)
+        update, start = ppo.make_update(config, trainer.policy, trainer.critic)
+        new, _ = update(start(learner.policy, learner.critic), trajectory, jax.random.PRNGKey(3))
+        return [
+            np.concatenate([np.ravel(x) for x in jax.tree.leaves(variables)])
+            for variables in (new.policy, new.critic)
+        ]
+
+    (policy, critic), (late_policy, late_critic) = learn(after), learn(late)
+    np.testing.assert_array_equal(policy, late_policy)
+    assert np.any(critic != late_critic)
+    whole, late_whole = (learn(t, cut_at_commands=False)[0] for t in (after, late))
+    assert np.any(whole != late_whole)
 
 
 def test_curve_has_a_row_per_interval(config, tmp_path, monkeypatch):

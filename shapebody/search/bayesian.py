@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import contextlib
 import warnings
 from dataclasses import dataclass
 
 import jax
 import numpy as np
 
-from shapebody.search.loop import Search, last_finite, require_integers, score, start_key
+from shapebody.search.loop import Search, cores, last_finite, require_integers, score, start_key
 
 
 @dataclass(frozen=True)
@@ -41,42 +40,49 @@ def bo(objective, starts, key, config: BOConfig) -> Search:
     posterior mean, since every value is of another minibatch. Designs whose value is not finite
     are not shown to the Gaussian process.
 
+    The starts take turns in Python processes, as many as there are cores; the objective is computed
+    in this one.
+
     Raises:
         ImportError: if PyTorch or BoTorch is not installed.
     """
-    with _torch():
-        return _bo(objective, np.asarray(starts, np.float32), key, config)
+    _require_botorch()
+    from joblib import Parallel, delayed  # comes with BoTorch
 
-
-def _bo(objective, starts, key, config):
+    starts = np.asarray(starts, np.float32)
     keys = jax.random.split(key, config.iterations + 1)
-    processes = [_Process(start, start_key(key, start), config) for start in starts]
-    designs = np.stack([process.initial() for process in processes])
-    values = np.asarray(score(objective, designs, keys[0]))
-    trajectory, history = [starts], [values[:, 0]]
-    for process, own_designs, own_values in zip(processes, designs, values, strict=True):
-        process.add(own_designs, own_values)
-    for batch_key in keys[1:]:
-        designs = np.stack([process.propose() for process in processes])
-        values = np.asarray(score(objective, designs, batch_key))
-        for process, own_designs, own_values in zip(processes, designs, values, strict=True):
-            process.add(own_designs, own_values)
-        trajectory.append(np.stack([process.best() for process in processes]))
-        history.append(np.asarray(score(objective, trajectory[-1][:, None], batch_key))[:, 0])
+    surrogates = [_Surrogate(start, start_key(key, start), config) for start in starts]
+    designs = [surrogate.initial() for surrogate in surrogates]
+    trajectory, history = [], []
+    # Not threads, which would share PyTorch's random numbers.
+    with Parallel(n_jobs=min(cores(), len(starts)), backend="loky") as parallel:
+        for iteration, batch_key in enumerate(keys):
+            values = np.asarray(score(objective, np.stack(designs), batch_key))
+            turns = parallel(
+                delayed(_turn)(*scored, last=iteration == config.iterations)
+                for scored in zip(surrogates, designs, values, strict=True)
+            )
+            surrogates, best, designs = zip(*turns, strict=True)
+            if iteration == 0:  # the first of the initial points
+                best = starts
+            else:
+                values = np.asarray(score(objective, np.stack(best)[:, None], batch_key))
+            trajectory.append(np.stack(best))
+            history.append(values[:, 0])
     trajectory, history = np.stack(trajectory), np.stack(history)
     found = last_finite(trajectory, history)
     return Search(found, trajectory, history, config.initial_points + config.iterations)
 
 
-class _Process:
-    """What one start knows: its scored designs and their Gaussian process in [0, 1]^d."""
+class _Surrogate:
+    """What one start knows: its scored designs and where the last fit to them ended."""
 
     def __init__(self, start, key, config):
         self.config = config
         self.start = start
         self.seeds = np.random.default_rng(np.asarray(jax.random.key_data(key)))
         self.designs, self.values = [], []
-        self.model = None
+        self.hyperparameters = None
 
     def seed(self) -> int:
         return int(self.seeds.integers(2**31))
@@ -90,14 +96,33 @@ class _Process:
         return np.concatenate([self.start[None], points[:, 0].numpy()]).astype(np.float32)
 
     def add(self, designs, values) -> None:
-        """Take scored designs [P, d] with values [P] and fit the Gaussian process anew."""
+        """Take scored designs [P, d] with values [P]."""
         finite = np.isfinite(values)
         self.designs.extend(designs[finite])
         self.values.extend(values[finite])
-        if finite.any():
-            self.model = _fit(np.stack(self.designs), np.stack(self.values), self.model)
 
-    def propose(self) -> np.ndarray:
+    def fit(self):
+        """Gaussian process in [0, 1]^d, fitted from where the last fit ended."""
+        import torch
+        from botorch.fit import fit_gpytorch_mll
+        from botorch.models import SingleTaskGP
+        from botorch.models.utils.gpytorch_modules import get_covar_module_with_dim_scaled_prior
+        from gpytorch.mlls import ExactMarginalLogLikelihood
+
+        kernel = get_covar_module_with_dim_scaled_prior(len(self.start), use_rbf_kernel=False)
+        model = SingleTaskGP(
+            torch.tensor((np.stack(self.designs) + 1) / 2, dtype=torch.float64),
+            torch.tensor(np.stack(self.values), dtype=torch.float64)[:, None],
+            covar_module=kernel,
+        )
+        if self.hyperparameters is not None:
+            for name, parameter in model.named_parameters():
+                parameter.data.copy_(self.hyperparameters[name])
+        fit_gpytorch_mll(ExactMarginalLogLikelihood(model.likelihood, model))
+        self.hyperparameters = {name: p.detach() for name, p in model.named_parameters()}
+        return model.eval()
+
+    def propose(self, model) -> np.ndarray:
         """The design that maximizes the acquisition function, float32 [1, d]."""
         import torch
         from botorch.acquisition.logei import qLogNoisyExpectedImprovement
@@ -105,12 +130,10 @@ class _Process:
         from botorch.sampling import SobolQMCNormalSampler
         from botorch.utils.sampling import manual_seed
 
-        if self.model is None:
-            return self.initial()[1:2]
         sampler = SobolQMCNormalSampler(torch.Size([128]), seed=self.seed())
         with manual_seed(self.seed()):
             acquisition = qLogNoisyExpectedImprovement(
-                self.model, self.model.train_inputs[0], sampler=sampler
+                model, model.train_inputs[0], sampler=sampler
             )
             point, _ = optimize_acqf(
                 acquisition,
@@ -122,34 +145,29 @@ class _Process:
             )
         return np.clip(2 * point.numpy() - 1, -1, 1).astype(np.float32)
 
-    def best(self) -> np.ndarray:
-        """The scored design [d] with the highest posterior mean; the start if there is none."""
-        if self.model is None:
-            return self.start
-        mean = self.model.posterior(self.model.train_inputs[0]).mean
-        return self.designs[int(mean.argmax())]
 
+def _turn(surrogate: _Surrogate, designs, values, last: bool):
+    """Learn from scored designs [P, d]: (surrogate, best design [d], next designs [1, d]).
 
-def _fit(designs, values, before):
-    """Gaussian process of designs [P, d] in [-1, 1]^d, fitted from where `before` ended."""
+    The best is the scored design with the highest posterior mean, or the start if none has a
+    finite value. After the `last` turn nothing new is proposed.
+    """
     import torch
-    from botorch.fit import fit_gpytorch_mll
-    from botorch.models import SingleTaskGP
-    from botorch.models.utils.gpytorch_modules import get_covar_module_with_dim_scaled_prior
-    from gpytorch.mlls import ExactMarginalLogLikelihood
 
-    kernel = get_covar_module_with_dim_scaled_prior(designs.shape[1], use_rbf_kernel=False)
-    model = SingleTaskGP(
-        torch.tensor((designs + 1) / 2, dtype=torch.float64),
-        torch.tensor(values, dtype=torch.float64)[:, None],
-        covar_module=kernel,
-    )
-    if before is not None:
-        hyperparameters = dict(before.named_parameters())
-        for name, parameter in model.named_parameters():
-            parameter.data.copy_(hyperparameters[name].data)
-    fit_gpytorch_mll(ExactMarginalLogLikelihood(model.likelihood, model))
-    return model.eval()
+    surrogate.add(designs, values)
+    if not surrogate.values:
+        return surrogate, surrogate.start, surrogate.initial()[1:2]
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)  # the matrices are small; more threads only wait for each other
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            model = surrogate.fit()
+            mean = model.posterior(model.train_inputs[0]).mean
+            best = surrogate.designs[int(mean.argmax())]
+            return surrogate, best, designs[:1] if last else surrogate.propose(model)
+    finally:
+        torch.set_num_threads(threads)
 
 
 def _bounds(dim, low):
@@ -158,23 +176,14 @@ def _bounds(dim, low):
     return torch.tensor([[low], [1.0]], dtype=torch.float64).expand(2, dim).contiguous()
 
 
-@contextlib.contextmanager
-def _torch():
-    """PyTorch on one thread, without the warnings of its modules and optimizers."""
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        try:
+def _require_botorch():
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
             import botorch  # noqa: F401
-            import torch
-        except ImportError as error:
-            raise ImportError(
-                "method 'bo' needs PyTorch and BoTorch, which are not part of environment.lock; "
-                "install them with: pip install 'shapebody[bo]' (in this repository: "
-                ".venv/bin/python -m pip install -e '.[bo]')"
-            ) from error
-        threads = torch.get_num_threads()
-        torch.set_num_threads(1)  # the matrices are small; more threads only wait for each other
-        try:
-            yield
-        finally:
-            torch.set_num_threads(threads)
+    except ImportError as error:
+        raise ImportError(
+            "method 'bo' needs PyTorch and BoTorch, which are not part of environment.lock; "
+            "install them with: pip install 'shapebody[bo]' (in this repository: "
+            ".venv/bin/python -m pip install -e '.[bo]')"
+        ) from error

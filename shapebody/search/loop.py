@@ -57,14 +57,14 @@ def iterate(objective, starts, key, config, steps: Steps, evaluations: int) -> S
     # Compiled here, once; threads that meet an uncompiled function would each compile it.
     run = _run.lower(objective, starts[0], key, config, steps).compile()
     # One population keeps two cores busy for little more than half of the time.
-    side_by_side = _cores() if jax.default_backend() == "cpu" else 1
+    side_by_side = cores() if jax.default_backend() == "cpu" else 1
     with ThreadPoolExecutor(side_by_side) as pool:
         found = pool.map(lambda start: jax.block_until_ready(run(objective, start, key)), starts)
         trajectory, history = (jnp.stack(values, axis=1) for values in zip(*found, strict=True))
     return Search(last_finite(trajectory, history), trajectory, history, evaluations)
 
 
-def _cores() -> int:
+def cores() -> int:
     """Number of processor cores that this process may use."""
     if hasattr(os, "sched_getaffinity"):
         return len(os.sched_getaffinity(0))
