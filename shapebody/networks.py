@@ -62,9 +62,9 @@ class PolicyConfig:
             nearly the same key and the sum can hardly tell them apart. 0.2 is a better start for
             short training; the authors' published Go2 policy ended at 0.1.
         minimum_temperature: lower bound of the temperature.
-        latent_scale: factor on the summed latent. A softmaxed key has entries of about 1/L, so at
-            1.0 the latent starts about L times smaller than the general observations beside it; a
-            value of the order of L makes both of order 1. Action means are not scaled.
+        latent_scale: factor on the summed latent, which enters the core beside the general
+            observations. Action means are not scaled. At 8.0 the joints' exploration noise hides
+            command and gait clock, and a hexapod learns to walk several times slower than at 1.0.
         initial_std: standard deviation of all actions before training.
         log_std_input: "tanh" (the key before the softmax) or "softmax" (the key after it).
         mean_limit: action means are clipped to +-mean_limit.
@@ -111,7 +111,6 @@ class PolicyConfig:
             key_widths=(32, 32),
             core_widths=(160, 96, 32),
             initial_temperature=0.2,
-            latent_scale=8.0,
         )
         return cls(**(sizes | changes))
 
@@ -130,8 +129,7 @@ class CriticConfig:
         joint_value_latent, foot_value_latent: width of a part's value.
         head_widths: hidden widths of every head; the output layer of width 1 follows.
         initial_temperature, minimum_temperature, latent_scale: see `PolicyConfig`. A direct-design
-            critic's latent is large at 1.0 already, because its values are made of descriptions:
-            at 8.0 it hides the command beside it, and the critic learns slowly what that is worth.
+            critic's latent is large at 1.0 already, because its values are made of descriptions.
 
     Raises:
         ValueError: if a value is out of range.
