@@ -63,8 +63,10 @@ class PolicyConfig:
             short training; the authors' published Go2 policy ended at 0.1.
         minimum_temperature: lower bound of the temperature.
         latent_scale: factor on the summed latent, which enters the core beside the general
-            observations. Action means are not scaled. At 8.0 the joints' exploration noise hides
-            command and gait clock, and a hexapod learns to walk several times slower than at 1.0.
+            observations; the paper has none (1.0). Action means are not scaled. A softmaxed key
+            has entries of about 1/L, so 8.0 makes both inputs of the core equally large, but it
+            also enlarges the joints' exploration noise, which then hides command and gait clock
+            from the core. Agents trained before 1.0 became the default keep their 8.0.
         initial_std: standard deviation of all actions before training.
         log_std_input: "tanh" (the key before the softmax) or "softmax" (the key after it).
         mean_limit: action means are clipped to +-mean_limit.

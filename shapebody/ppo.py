@@ -33,7 +33,7 @@ import optax
 from shapebody.checkpoints import Agent, atomic_write, load_arrays, save_agent, save_arrays
 from shapebody.files import read_safetensors
 from shapebody.locomotion import Locomotion, TaskConfig, Trajectory
-from shapebody.locomotion.observations import Observation
+from shapebody.locomotion.observations import COMMAND, Observation
 from shapebody.networks import (
     Critic,
     CriticConfig,
@@ -202,12 +202,14 @@ class Learner:
 def advantages(reward, value, last_value, terminated, truncated, discount, gae_lambda):
     """Generalized advantage estimation over [N, T] (last_value [N]); returns [N, T].
 
-    A terminated episode is worth nothing afterwards. A truncated one would have gone on: its
-    last state's value stands for that of the next state, one control step later.
+    A terminated episode is worth nothing afterwards, whatever `truncated` says there. A truncated
+    one would have gone on: its last state's value stands for that of the next state, one control
+    step later.
     """
     done = terminated | truncated
     following = jnp.concatenate([value[:, 1:], last_value[:, None]], 1)
-    following = jnp.where(truncated, value, jnp.where(terminated, 0.0, following))
+    following = jnp.where(truncated, value, following)
+    following = jnp.where(terminated, 0.0, following)
     error = reward + discount * following - value
 
     def backward(advantage, inputs):
@@ -224,8 +226,9 @@ def command_changes(observation: Observation, last_observation: Observation):
 
     observation: [N, T, ...]; last_observation: [N, ...], after the last step.
     """
-    commands = observation.general[..., 3:6]
-    following = jnp.concatenate([commands[:, 1:], last_observation.general[:, None, 3:6]], 1)
+    commands = observation.general[..., COMMAND]
+    last = last_observation.general[:, None, COMMAND]
+    following = jnp.concatenate([commands[:, 1:], last], 1)
     return jnp.any(following != commands, -1)
 
 
@@ -894,7 +897,7 @@ def _from_plain(kind, values: dict):
     return kind(**{name: value(hints.get(name), given) for name, given in values.items()})
 
 
-SCHEDULE = (
+CHANGEABLE = (
     "total_steps",
     "epochs",
     "minibatch_size",
@@ -910,9 +913,12 @@ def as_continued(config: TrainConfig, folder=None) -> TrainConfig:
     """The configuration of the run in the folder of `config`, if there is one to continue.
 
     `config` itself if there is none, or one of other robots or of another scale. So a run goes on
-    with the settings that it was begun with, whatever the defaults are now.
+    with the settings that it was begun with, whatever the defaults are now. To change one that may
+    change (`CHANGEABLE`), replace it in the result.
     """
     folder = Path(folder) if folder else data_dir() / "checkpoints" / config.name
+    if not (folder / "training.safetensors").exists():
+        return config
     try:
         plain = json.loads((folder / "training.json").read_text())[-1]["config"]
         last = _from_plain(TrainConfig, plain)
@@ -931,7 +937,7 @@ def _continued(path: Path, config: TrainConfig, steps: int, robots=()) -> list[d
     with hashes of the robots' files.
 
     Raises:
-        ValueError: if more than the schedule, or a robot's file, differs from the run in `path`.
+        ValueError: if more than `CHANGEABLE`, or a robot's file, differs from the run in `path`.
     """
     try:
         phases = json.loads(path.read_text())
@@ -952,12 +958,13 @@ def _continued(path: Path, config: TrainConfig, steps: int, robots=()) -> list[d
         ) from error
     now = _plain(config)
     different = [name for name in now if before.get(name) != now[name]]
-    other = [name for name in different if name not in SCHEDULE]
+    other = [name for name in different if name not in CHANGEABLE]
     if other:
-        text = "; ".join(f"{name} was {before.get(name)!r}, is {now[name]!r}" for name in other)
+        text = "; ".join(_difference(name, before.get(name), now[name]) for name in other)
         raise ValueError(
             f"the run in {path.parent.name} has another configuration ({text}); continue it with "
-            "the old one, choose another name, or delete its training.safetensors to begin anew"
+            "the old one, which shapebody.ppo.as_continued(config) returns, choose another name, "
+            "or delete its training.safetensors to begin anew"
         )
     known = phases[0].get("robots", {})
     changed = [r.name for r in robots if known.get(r.name, _robot_hash(r)) != _robot_hash(r)]
@@ -967,6 +974,13 @@ def _continued(path: Path, config: TrainConfig, steps: int, robots=()) -> list[d
             f"{path.parent.name} began; put the old file back, or train under another name"
         )
     return phases + [{"from_step": steps, "config": now}] if different else phases
+
+
+def _difference(name: str, old, new) -> str:
+    if isinstance(old, dict) and isinstance(new, dict):
+        inside = [key for key in new if old.get(key) != new[key]]
+        return "; ".join(_difference(f"{name}.{key}", old.get(key), new[key]) for key in inside)
+    return f"{name} was {old!r}, is {new!r}"
 
 
 class _Curve:
@@ -1009,7 +1023,8 @@ class _Curve:
         self.count += 1
         for name, value in values.items():
             self.sums[name] = self.sums.get(name, 0.0) + value
-        self.latest = self._row()
+        # Where no episode has ended since the last row, the last ones that did are shown.
+        self.latest = self.latest | self._row()
 
     def _row(self):
         row = {name: self.sums[name] / self.count for name in CURVE if name in self.sums}
@@ -1051,11 +1066,12 @@ class _Report:
         self.next = now + self.interval
         row = curve.latest
         left = (self.config.total_steps - steps) / max(row["steps_per_second"], 1e-9)
+        ended = "no episode has ended yet"
+        if "return" in row:
+            ended = f"return {row['return']:6.2f}  xy error {row['tracking_error']:.3f} m/s"
         line = (
-            f"{steps:>12,} steps  return {row.get('return', float('nan')):6.2f}  "
-            f"xy error {row.get('tracking_error', float('nan')):.3f} m/s  "
-            f"c {row['coefficient']:.2f}  {row['steps_per_second']:,.0f} steps/s  "
-            f"{_duration(left)} left"
+            f"{steps:>12,} steps  {ended}  c {row['coefficient']:.2f}  "
+            f"{row['steps_per_second']:,.0f} steps/s  {_duration(left)} left"
         )
         print(
             ("\r" if self.interactive else "") + line,

@@ -520,11 +520,12 @@ def test_without_botorch_the_error_names_the_fix(monkeypatch):
 
 
 @NO_BOTORCH
-def test_bo_leaves_pytorch_as_it_was():
+@pytest.mark.parametrize("starts", [1, 3])  # in this process, and in several
+def test_bo_leaves_pytorch_as_it_was(starts):
     import torch
 
     threads, state = torch.get_num_threads(), torch.get_rng_state()
-    run("bo", Quadratic(jnp.zeros(4)), uniform(1, 4), **SMALL["bo"])
+    run("bo", Quadratic(jnp.zeros(4)), uniform(starts, 4), **SMALL["bo"])
     assert torch.get_num_threads() == threads
     assert torch.equal(torch.get_rng_state(), state)
 

@@ -19,7 +19,8 @@ def test_advantages_against_a_plain_loop():
     reward, value = rng.normal(size=(2, n, t)).astype(np.float32)
     last = rng.normal(size=n).astype(np.float32)
     terminated = rng.random((n, t)) < 0.2
-    truncated = (rng.random((n, t)) < 0.2) & ~terminated
+    truncated = rng.random((n, t)) < 0.2  # a fall counts, whatever else happens in its step
+    assert np.any(terminated & truncated)
     got = ppo.advantages(reward, value, last, terminated, truncated, discount, lam)
     for i in range(n):
         advantage = 0.0
@@ -56,6 +57,7 @@ def test_configurations():
     assert (full.discount, full.gae_lambda, full.clip_range) == (0.99, 0.7, 0.1)
     assert (full.entropy_coefficient, full.max_gradient_norm) == (0.005, 3.0)
     assert full.kl_threshold == 0.5 and full.total_steps == 10**9
+    assert full.value_lambda is None and not full.cut_at_commands  # as the paper has it
     with pytest.raises(ValueError, match="minibatch_size is 1000"):
         replace(full, minibatch_size=1000)
     with pytest.raises(ValueError, match="scale is 'huge'"):
@@ -135,6 +137,9 @@ def test_a_run_continues_only_with_its_own_configuration(config, tmp_path):
     assert ppo.as_continued(config, tmp_path / "nothing") == config
     other = replace(config, scale="full")
     assert ppo.as_continued(other, tmp_path) == other
+    wider = replace(config, policy=replace(config.policy, latent_scale=3.0))
+    with pytest.raises(ValueError, match=r"policy.latent_scale was 1.0, is 3.0.*as_continued"):
+        ppo.Trainer(wider, tmp_path).start()
     # A run that is older than a setting goes on with the setting's default.
     for phase in longer.phases:
         del phase["config"]["task"]["design_radius"]
@@ -148,6 +153,7 @@ def test_a_run_continues_only_with_its_own_configuration(config, tmp_path):
     with pytest.raises(ValueError, match="training.json is missing or damaged"):
         longer.start()
     (tmp_path / "training.safetensors").rename(tmp_path / "gone")
+    assert ppo.as_continued(config, tmp_path) == config  # a new run, with today's settings
     (tmp_path / "agent.json").write_text("{}")
     with pytest.raises(ValueError, match="would overwrite"):
         longer.start()
@@ -273,6 +279,35 @@ def test_advantages_end_where_the_command_changes(straight):
     assert np.any(critic != late_critic)
     whole, late_whole = (learn(t, cut_at_commands=False)[0] for t in (after, late))
     assert np.any(whole != late_whole)
+    # The next episode after a fall has another command too, and that is not a reason to spare it.
+    ended = np.asarray(after.terminated).copy()
+    ended[3] = True
+    fall = replace(after, terminated=ended, truncated=np.zeros_like(ended))
+    np.testing.assert_array_equal(learn(fall)[0], learn(fall, cut_at_commands=False)[0])
+    assert np.any(learn(fall)[0] != policy)
+
+
+def test_the_critic_has_a_lambda_of_its_own(straight):
+    _, trainer = straight
+    state = trainer.env.reset(jax.random.PRNGKey(1), coefficient=0.0)
+    learner = trainer.learner
+    _, trajectory = trainer.env.rollout(trainer.act, learner.policy, state, jax.random.key(2), 8)
+
+    def learn(value_lambda, gae_lambda):
+        config = replace(trainer.config, epochs=1, value_lambda=value_lambda, gae_lambda=gae_lambda)
+        update, start = ppo.make_update(config, trainer.policy, trainer.critic)
+        new, _ = update(start(learner.policy, learner.critic), trajectory, jax.random.PRNGKey(3))
+        return [
+            np.concatenate([np.ravel(x) for x in jax.tree.leaves(v)])
+            for v in (new.policy, new.critic)
+        ]
+
+    policy, critic = learn(0.95, 0.7)
+    other_policy, other_critic = learn(0.0, 0.7)
+    np.testing.assert_array_equal(policy, other_policy)
+    assert np.any(critic != other_critic)
+    np.testing.assert_array_equal(critic, learn(0.95, 0.2)[1])
+    np.testing.assert_array_equal(learn(None, 0.7)[1], learn(0.7, 0.7)[1])
 
 
 def test_curve_has_a_row_per_interval(config, tmp_path, monkeypatch):

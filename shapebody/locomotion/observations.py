@@ -32,6 +32,10 @@ class Observation:
     privileged: jax.Array  # [5]
 
 
+COMMAND = slice(3, 6)
+"""Where the command is in the general observations."""
+
+
 def foot_contact(readings: Readings, descriptions: Descriptions):
     """Which feet touch the floor, float32[F]: a foot's lowest point is below z = 0."""
     # How far the half-extents of a box reach down.

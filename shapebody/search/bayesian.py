@@ -10,6 +10,9 @@ import numpy as np
 
 from shapebody.search.loop import Search, cores, last_finite, require_integers, score, start_key
 
+PROCESSES = 4
+"""Most Python processes that a search starts."""
+
 
 @dataclass(frozen=True)
 class BOConfig:
@@ -40,14 +43,15 @@ def bo(objective, starts, key, config: BOConfig) -> Search:
     posterior mean, since every value is of another minibatch. Designs whose value is not finite
     are not shown to the Gaussian process.
 
-    The starts take turns in Python processes, as many as there are cores; the objective is computed
-    in this one.
+    The Gaussian processes of different starts are fitted side by side, in up to `PROCESSES` Python
+    processes, of some hundred megabytes each; the objective is computed in this one.
 
     Raises:
-        ImportError: if PyTorch or BoTorch is not installed.
+        ImportError: if PyTorch, BoTorch or joblib is not installed.
     """
     _require_botorch()
-    from joblib import Parallel, delayed  # comes with BoTorch
+    from joblib import Parallel, delayed
+    from joblib.externals.loky import get_reusable_executor
 
     starts = np.asarray(starts, np.float32)
     keys = jax.random.split(key, config.iterations + 1)
@@ -55,20 +59,26 @@ def bo(objective, starts, key, config: BOConfig) -> Search:
     designs = [surrogate.initial() for surrogate in surrogates]
     trajectory, history = [], []
     # Not threads, which would share PyTorch's random numbers.
-    with Parallel(n_jobs=min(cores(), len(starts)), backend="loky") as parallel:
-        for iteration, batch_key in enumerate(keys):
-            values = np.asarray(score(objective, np.stack(designs), batch_key))
-            turns = parallel(
-                delayed(_turn)(*scored, last=iteration == config.iterations)
-                for scored in zip(surrogates, designs, values, strict=True)
-            )
-            surrogates, best, designs = zip(*turns, strict=True)
-            if iteration == 0:  # the first of the initial points
-                best = starts
-            else:
-                values = np.asarray(score(objective, np.stack(best)[:, None], batch_key))
-            trajectory.append(np.stack(best))
-            history.append(values[:, 0])
+    processes = min(cores(), len(starts), PROCESSES)
+    try:
+        with Parallel(n_jobs=processes, backend="loky") as parallel:
+            for iteration, batch_key in enumerate(keys):
+                values = np.asarray(score(objective, np.stack(designs), batch_key))
+                turns = parallel(
+                    delayed(_turn)(*scored, last=iteration == config.iterations)
+                    for scored in zip(surrogates, designs, values, strict=True)
+                )
+                surrogates, best, designs = zip(*turns, strict=True)
+                if iteration == 0:  # the first of the initial points
+                    best = starts
+                else:
+                    values = np.asarray(score(objective, np.stack(best)[:, None], batch_key))
+                trajectory.append(np.stack(best))
+                history.append(values[:, 0])
+    finally:
+        if processes > 1:
+            # joblib would keep the processes, and their memory, for minutes.
+            get_reusable_executor().shutdown(wait=True)
     trajectory, history = np.stack(trajectory), np.stack(history)
     found = last_finite(trajectory, history)
     return Search(found, trajectory, history, config.initial_points + config.iterations)
@@ -181,6 +191,7 @@ def _require_botorch():
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
             import botorch  # noqa: F401
+            import joblib  # noqa: F401
     except ImportError as error:
         raise ImportError(
             "method 'bo' needs PyTorch and BoTorch, which are not part of environment.lock; "
