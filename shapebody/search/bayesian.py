@@ -61,7 +61,12 @@ def bo(objective, starts, key, config: BOConfig) -> Search:
     # Not threads, which would share PyTorch's random numbers.
     processes = min(cores(), len(starts), PROCESSES)
     try:
-        with Parallel(n_jobs=processes, backend="loky") as parallel:
+        with (
+            warnings.catch_warnings(),
+            Parallel(n_jobs=processes, backend="loky") as parallel,
+        ):
+            # joblib replaces a process that has grown; its work is done all the same.
+            warnings.filterwarnings("ignore", message="A worker stopped while some jobs")
             for iteration, batch_key in enumerate(keys):
                 values = np.asarray(score(objective, np.stack(designs), batch_key))
                 turns = parallel(
