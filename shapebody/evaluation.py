@@ -376,14 +376,21 @@ def bootstrap_interval(
             outside (0, 1).
     """
     values = _differences(values, baseline)
+    weights = _resampled(np.random.default_rng(seed), values.shape[-1], resamples)
+    low, high = _percentiles(values @ weights.T, confidence)
+    return _out(low), _out(high)
+
+
+def _resampled(rng, n: int, resamples: int):
+    """Weights [resamples, n]: how often each of n numbers was drawn, over n."""
+    return rng.multinomial(n, np.full(n, 1 / n), size=resamples) / n
+
+
+def _percentiles(means, confidence: float):
     if not 0 < confidence < 1:
         raise ValueError(f"confidence is {confidence!r}; expected a number between 0 and 1")
-    n = values.shape[-1]
-    counts = np.random.default_rng(seed).multinomial(n, np.full(n, 1 / n), size=resamples)
-    means = values @ (counts.T / n)
     tail = (1 - confidence) / 2
-    low, high = np.quantile(means, [tail, 1 - tail], axis=-1)
-    return _out(low), _out(high)
+    return np.quantile(means, [tail, 1 - tail], axis=-1)
 
 
 class Gain(NamedTuple):
@@ -406,9 +413,10 @@ def paired_gain(
 ) -> Gain:
     """Gain in return ΔR of designs `after` over designs `before`, paired by start.
 
-    With [S, E] returns the unit is the start: episodes are averaged first, and the interval is a
-    bootstrap over the S starts. With [E] returns of one design it is a bootstrap over the paired
-    episodes. Evaluate both with the same seed.
+    With [S, E] returns the interval is a bootstrap over the S starts and the E episodes at once:
+    all designs live through the same episodes, so what these episodes happen to favour is common
+    to all starts and does not average out over them. With [E] returns of one design it is a
+    bootstrap over the paired episodes. Evaluate both with the same seed.
 
     Raises:
         ValueError: if the shapes differ, or the two evaluations had other seeds or settings.
@@ -427,11 +435,16 @@ def paired_gain(
     differences = _differences(after, before)
     if differences.ndim > 2:
         raise ValueError(f"returns have shape {differences.shape}; expected [E] or [S, E]")
-    if differences.ndim == 2:
+    if differences.ndim == 1:
+        low, high = bootstrap_interval(
+            differences, confidence=confidence, resamples=resamples, seed=seed
+        )
+    else:
+        rng = np.random.default_rng(seed)
+        starts, episodes = (_resampled(rng, n, resamples) for n in differences.shape)
+        means = np.sum(starts @ differences * episodes, axis=-1)
+        low, high = map(float, _percentiles(means, confidence))
         differences = differences.mean(-1)
-    low, high = bootstrap_interval(
-        differences, confidence=confidence, resamples=resamples, seed=seed
-    )
     return Gain(float(differences.mean()), low, high, differences)
 
 

@@ -131,7 +131,8 @@ def result_in_parts(
     """`result` for long computations: each part is stored as soon as it is done.
 
     A computation that was interrupted goes on with the first part that is missing. The file may
-    hold more parts than are asked for.
+    hold more parts than are asked for. A file of another agent or of other settings is not
+    overwritten: it is renamed to <name>.old.json.
 
     Args:
         name, agent, config: see `result`.
@@ -145,6 +146,7 @@ def result_in_parts(
     """
     path, kept = _result_path(name), scale() != "smoke"
     known = _known_parts(path, agent, config, recompute) if kept else {}
+    another = kept and not known and path.exists()
     for number, (part, compute) in enumerate(parts.items(), 1):
         if part in known and not recompute:
             continue
@@ -156,6 +158,9 @@ def result_in_parts(
             path.parent.mkdir(parents=True, exist_ok=True)
             temporary = path.with_name(path.name + ".tmp")
             temporary.write_text(_one_record_per_line(known))
+            if another:
+                _set_aside(path)
+                another = False
             os.replace(temporary, path)
         if progress:
             seconds = source["seconds"]
@@ -167,6 +172,15 @@ def result_in_parts(
         "records": [record for one in chosen for record in one["records"]],
         "provenance": {**latest, "seconds": seconds},
     }
+
+
+def _set_aside(path) -> None:
+    number, old = 1, path.with_suffix(".old.json")
+    while old.exists():
+        number += 1
+        old = path.with_suffix(f".old{number}.json")
+    os.replace(path, old)
+    print(f"{path.name} was of another agent or other settings: kept as {old.name}")
 
 
 def stored_parts(name: str, agent=None, **config) -> list[str]:

@@ -3,6 +3,7 @@
 Section 4.1 (methods), Appendix D (trust region).
 """
 
+import numbers
 from functools import partial
 from typing import NamedTuple
 
@@ -77,13 +78,34 @@ def design_study(
         became non-finite, predicted value (mean critic value over the state bank, without
         penalty), distance |f - f_ref| / sqrt(d), and the curve of the search: evaluations and
         objective (on the whole state bank) at some of its iterations.
+
+    Raises:
+        ValueError: for a run or a setting that cannot be, before anything is computed.
     """
     setting = dict(starts=starts, episodes=episodes, horizon=horizon, seed=seed)
+    for name, value in setting.items():
+        least = 0 if name == "seed" else 1
+        if not isinstance(value, numbers.Integral) or value < least:
+            raise ValueError(f"{name} is {value!r}; expected an integer of at least {least}")
+    for run in runs:
+        _validate(run)
     short = {} if iterations is None else {"iterations": iterations}
     parts = {"starts and reference": partial(_initial_records, agent, robot, **setting)}
     for run in runs:
         parts[_part(run)] = partial(_run_records, agent, robot, run, short, **setting)
     return result_in_parts(_file(robot), parts, agent, recompute, progress, **setting, **short)
+
+
+def _validate(run: Run) -> None:
+    if run.method not in METHODS:
+        raise ValueError(f"unknown method {run.method!r} in {run}; known: {', '.join(METHODS)}")
+    if run.origin not in ("start", "reference"):
+        raise ValueError(f"origin is {run.origin!r} in {run}; expected 'start' or 'reference'")
+    value, alone = run.trust_region, run.method == CONTROL.method
+    if alone and value is not None:
+        raise ValueError(f"trust_region is {value!r} in {run}; expected None, it has no λ")
+    if not alone and not (isinstance(value, numbers.Real) and 0 <= value < np.inf):
+        raise ValueError(f"trust_region is {value!r} in {run}; expected a number of at least 0")
 
 
 def _file(robot) -> str:
@@ -205,18 +227,22 @@ def gains(records: list[dict], quantity: str = "return") -> list[dict]:
 
     Returns:
         One record per comparison: method, over ("start", "penalty-only" or "reference"),
-        trust_region (None where none was used), mean, low and high of the paired difference in
-        return, the number of pairs, and how many of them are positive. The pairs are the starts;
-        for the search from the reference they are the episodes of one pair of designs.
+        trust_region (None where none was used), mean, low and high of the paired difference,
+        the number of pairs, and how many of them are positive. The pairs are the starts; for the
+        search from the reference they are the episodes of one pair of designs. Intervals of
+        returns are over starts and episodes (`paired_gain`), those of other quantities over starts
+        alone, which leaves out the luck with the episodes that all starts share.
 
     Raises:
         ValueError: if a design has no counterpart to be compared with.
     """
+    # Returns are stored by episode, other quantities as means.
+    detail = "returns" if quantity == "return" else quantity
     found: dict = {}
     for record in records:
         if record["origin"] == "start":
             key = record["method"], record["trust_region"]
-            found.setdefault(key, {})[record["start"]] = record[quantity]
+            found.setdefault(key, {})[record["start"]] = record[detail]
     reference = [r for r in records if r["origin"] == "reference"]
     base = [r for r in reference if r["method"] == "none"]
     initial = found.get(("none", None), {})
@@ -241,7 +267,7 @@ def gains(records: list[dict], quantity: str = "return") -> list[dict]:
         values = dict(mean=mean, low=low, high=high, pairs=pairs, positive=positive)
         rows.append({"method": method, "over": over, "trust_region": trust_region, **values})
 
-    compare("reference", "start", None, dict.fromkeys(initial, base[0][quantity]), initial)
+    compare("reference", "start", None, dict.fromkeys(initial, base[0][detail]), initial)
     for (method, trust_region), after in found.items():
         if method == "none":
             continue

@@ -197,15 +197,19 @@ def test_paired_differences():
     assert np.all(low > 0.85) and np.all(high < 1.15) and np.all(low < high)
 
 
-def test_gain_is_averaged_over_episodes_and_resampled_over_starts():
-    before = np.zeros((4, 50))
-    after = np.arange(4)[:, None] + np.tile([-10.0, 10.0], 25)
-    gain = paired_gain(after, before)
+def test_gain_is_resampled_over_starts_and_episodes():
+    starts, episodes = np.arange(4.0)[:, None], np.tile([-10.0, 10.0], 25)
+    gain = paired_gain(starts + np.zeros(50), np.zeros((4, 50)))
     np.testing.assert_allclose(gain.differences, [0, 1, 2, 3])
     assert gain.mean == pytest.approx(1.5)
-    # The spread within a start does not enter.
-    assert (gain.low, gain.high) == bootstrap_interval([0, 1, 2, 3])
-    single = paired_gain(after[0], before[0])
+    assert (gain.low, gain.high) == pytest.approx(bootstrap_interval([0, 1, 2, 3]), abs=0.06)
+    # Luck with the episodes is common to all starts: more starts do not average it out.
+    common = paired_gain(np.tile(episodes, (400, 1)), np.zeros((400, 50)))
+    assert (common.low, common.high) == pytest.approx(bootstrap_interval(episodes), abs=0.3)
+    both = paired_gain(starts + episodes, np.zeros((4, 50)))
+    variance = starts.var() / 4 + episodes.var() / 50
+    assert both.high - both.low == pytest.approx(2 * 1.96 * variance**0.5, rel=0.05)
+    single = paired_gain(episodes, np.zeros(50))
     assert single.mean == pytest.approx(0) and single.high > 2
 
 

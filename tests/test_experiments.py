@@ -130,10 +130,15 @@ def test_parts_are_stored_one_by_one_and_an_interruption_keeps_them(results):
     assert len(experiments.result_in_parts("x", three, AGENT, starts=2)["records"]) == 2
     assert list(json.loads((results / "x.json").read_text())["parts"]) == ["one", "two", "three"]
     assert one.calls == 1
-    # Other settings make all parts another result.
-    experiments.result_in_parts("x", {"one": one}, AGENT, starts=3)
-    assert list(json.loads((results / "x.json").read_text())["parts"]) == ["one"]
-    assert one.calls == 2
+    # Other settings make all parts another result. The old ones are kept beside it.
+    before = (results / "x.json").read_text()
+    experiments.result_in_parts("x", {"one": one, "two": two}, AGENT, starts=3)
+    assert list(json.loads((results / "x.json").read_text())["parts"]) == ["one", "two"]
+    assert (one.calls, two.calls) == (2, 2)
+    assert (results / "x.old.json").read_text() == before
+    experiments.result_in_parts("x", {"one": one}, AGENT, starts=2)
+    assert (results / "x.old.json").read_text() == before
+    assert "one" in json.loads((results / "x.old2.json").read_text())["parts"]
 
 
 # gains

@@ -111,6 +111,24 @@ def test_what_is_stored_is_not_computed_again(results, agent, robot, monkeypatch
     assert len(json.loads(path.read_text())["parts"]) == 4
 
 
+@pytest.mark.parametrize(
+    "run, message",
+    [
+        (Run("adam"), "unknown method 'adam' .* known: vgds, penalty-only, random"),
+        (Run("vgds", None), "trust_region is None"),
+        (Run("vgds", -1.0), "trust_region is -1.0 .* at least 0"),
+        (Run("penalty-only", 20.0), "expected None"),
+        (Run("vgds", 20.0, "refrence"), "origin is 'refrence'"),
+    ],
+)
+def test_a_run_that_cannot_be_stops_before_the_first(results, agent, robot, run, message):
+    with pytest.raises(ValueError, match=message):
+        design_study(agent, robot, (CONTROL, run), **SETTING)
+    with pytest.raises(ValueError, match="starts is 0; expected an integer of at least 1"):
+        design_study(agent, robot, RUNS, **dict(SETTING, starts=0))
+    assert not results.exists()
+
+
 def test_available_runs_are_installed_or_stored(results, agent, robot, monkeypatch):
     runs = (CONTROL, Run("bo"), Run("vgds", 20.0))
     monkeypatch.setattr(
@@ -134,6 +152,7 @@ def test_readme_states_the_stored_results():
     for name in experiments.trained_robots(paper.ROBOTS):
         robot, agent = load_robot(name), load_agent(name)
         path = data_dir() / "results" / f"design_study_{name}.json"
+        assert path.exists(), f"the agent {name} is shipped without its design study {path.name}"
         parts = json.loads(path.read_text())["parts"].values()
         records = [record for part in parts for record in part["records"]]
         before = {

@@ -112,7 +112,7 @@ class Objective:
                 f"trust_region is {trust_region!r}; expected a finite number of at least 0 "
                 "(the penalty coefficient, 100 in the paper)"
             )
-        if batch_size != int(batch_size) or batch_size < 1:
+        if not isinstance(batch_size, numbers.Integral) or batch_size < 1:
             raise ValueError(f"batch_size is {batch_size!r}; expected an integer of at least 1")
         values = design_critic(robot, agent.critic_config)
         space = values.space
