@@ -79,7 +79,7 @@ def agent_name(robot: str) -> str:
     """Name of the shipped agent for a robot at the scale in force: at `full`, the one trained with
     the paper's networks where there is one. `smoke` uses the reduced agent."""
     full = f"{robot}_full"
-    if scale() == "full" and (data_dir() / "checkpoints" / full).is_dir():
+    if scale() == "full" and (data_dir() / "checkpoints" / full / "agent.json").exists():
         return full
     return robot
 
@@ -165,11 +165,19 @@ def result_in_parts(
         if progress:
             seconds = source["seconds"]
             print(f"{number} of {len(parts)}: {part}, {seconds:.0f} s", flush=True)
-    chosen = [known[part] for part in parts]
-    latest = chosen[-1]["provenance"]
-    seconds = round(sum(one["provenance"]["seconds"] for one in chosen), 1)
+    return _joined([known[part] for part in parts])
+
+
+def stored_result(path) -> dict:
+    """What `result` returned when it wrote that file."""
+    return _joined(list(json.loads(path.read_text())["parts"].values()))
+
+
+def _joined(parts: list[dict]) -> dict:
+    latest = parts[-1]["provenance"]
+    seconds = round(sum(one["provenance"]["seconds"] for one in parts), 1)
     return {
-        "records": [record for one in chosen for record in one["records"]],
+        "records": [record for one in parts for record in one["records"]],
         "provenance": {**latest, "seconds": seconds},
     }
 

@@ -79,7 +79,8 @@ def learning_curve(path: str | Path, y: str, x: str = "steps", ax=None, smooth: 
         weights = np.ones(smooth)
         present = np.isfinite(values)
         total = np.convolve(np.where(present, values, 0), weights, mode="same")
-        smoothed = total / np.maximum(np.convolve(present, weights, mode="same"), 1)
+        count = np.convolve(present, weights, mode="same")
+        smoothed = np.where(count > 0.5, total / np.maximum(count, 1), np.nan)
         (line,) = ax.plot(columns[x], smoothed, **style)
         ax.plot(columns[x], values, color=line.get_color(), alpha=0.25, linewidth=0.8)
     else:
@@ -163,6 +164,26 @@ def paper_table(rows: Iterable[Sequence], digits: int = 2, caption: str = "", no
     Values as in `table`. note: header of our column, best with scale and engine.
     """
     return table(rows, ("", "paper", note), digits, caption)
+
+
+def agents_table(agents: Iterable):
+    """Table of agents that are compared: their training, and that of the critic they bring."""
+    from shapebody.checkpoints import load_curve
+
+    rows = []
+    for agent in agents:
+        sharpened = agent.metadata.get("policy_evaluation")
+        rows.append(
+            (
+                agent.name,
+                f"{agent.metadata['steps'] / 1e6:.1f} million",
+                float(load_curve(agent.name)["coefficient"][-1]),
+                f"{sharpened['steps'] / 1e6:.1f} million" if sharpened else None,
+                f"{agent.critic_config.latent_scale:g}",
+            )
+        )
+    header = ("agent", "training steps", "c at their end", "policy evaluation", "latent scale")
+    return table(rows, header)
 
 
 def _text(value, digits) -> str:

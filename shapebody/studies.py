@@ -4,6 +4,7 @@ Section 4.1 (methods), Appendix D (trust region).
 """
 
 import numbers
+from dataclasses import replace
 from functools import partial
 from typing import NamedTuple
 
@@ -12,8 +13,10 @@ import numpy as np
 from shapebody import paper
 from shapebody.design import DesignSpace
 from shapebody.evaluation import EvaluationConfig, evaluate, paired_gain
-from shapebody.experiments import result_in_parts, stored_parts
+from shapebody.experiments import result, result_in_parts, stored_parts, stored_result
 from shapebody.locomotion import TaskConfig
+from shapebody.paths import data_dir
+from shapebody.published import load_published_policy
 from shapebody.search import METHODS, Objective, search
 
 
@@ -322,3 +325,52 @@ def value_against_return(
         }
         for i in range(designs)
     ]
+
+
+def published_policy(robot, agent, folder=None, starts: int = 10, episodes: int = 16) -> dict:
+    """Returns that the authors' published policy earns in our environment.
+
+    Args:
+        robot: the robot of that policy.
+        agent: any agent for it; only its policy is replaced.
+        folder: with the authors' files (`load_published_policy`). Without it the stored result
+            is returned.
+        starts, episodes: start designs, and evaluation episodes per design.
+
+    Returns:
+        {"records": ..., "provenance": ...} with records of the reference and of the starts as in
+        `design_study`, without what a critic has to say.
+
+    Raises:
+        FileNotFoundError: if nothing is stored and no folder is given.
+    """
+    name = f"published_policy_{robot.name}"
+    path = data_dir() / "results" / f"{name}.json"
+    if folder is None:
+        if not path.exists():
+            raise FileNotFoundError(
+                f"{path.name} is not in data/results; give the folder of the authors' weights"
+            )
+        return stored_result(path)
+
+    def compute():
+        module, variables = load_published_policy(folder, robot.name)
+        theirs = replace(agent, name="published", policy_config=module.config, policy=variables)
+        space = DesignSpace(robot)
+        rows = [("reference", None, space.reference)]
+        rows += [("start", i, space.start(i)) for i in range(starts)]
+        score = evaluate(theirs, robot, np.stack([f for *_, f in rows]), episodes)
+        return [
+            {
+                "origin": origin,
+                "start": number,
+                "return": float(score.returns[i].mean()),
+                "tracking_error": float(score.tracking_error[i].mean()),
+                "length": float(score.lengths[i].mean()),
+                "engine": score.settings["engine"],
+                "returns": [round(value, 3) for value in score.returns[i].tolist()],
+            }
+            for i, (origin, number, _) in enumerate(rows)
+        ]
+
+    return result(name, compute, recompute=True, starts=starts, episodes=episodes)

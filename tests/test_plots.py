@@ -2,7 +2,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 import pytest
 
-from shapebody import plots
+from shapebody import load_agent, plots
 
 
 @pytest.fixture
@@ -25,6 +25,21 @@ def test_smoothing_skips_missing_values(curve):
     assert smooth.get_ydata() == pytest.approx([2, 2, 4, 5])
     assert len(raw.get_ydata()) == 4
     plt.close("all")
+
+
+def test_smoothing_draws_nothing_where_nothing_is_known(tmp_path):
+    path = tmp_path / "curve.csv"
+    path.write_text("steps,return\n" + "".join(f"{i},\n" for i in range(5)) + "5,4\n6,6\n")
+    smooth = plots.learning_curve(path, "return", smooth=3).lines[0].get_ydata()
+    assert np.isnan(smooth[:4]).all() and smooth[4:] == pytest.approx([4, 5, 5])
+    plt.close("all")
+
+
+def test_agents_table():
+    agents = [load_agent(name) for name in ("unitree_go2", "golem")]
+    first, second = plots.agents_table(agents).rows
+    assert first[0] == "unitree_go2" and first[1].endswith(" million")
+    assert 0 < float(second[2]) <= 1
 
 
 def test_missing_column_is_named(curve):

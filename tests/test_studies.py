@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from test_networks import published_layers, write_published
 from tiny import quick_compilation, tiny_agent, tiny_robot
 
 from shapebody import experiments, paper, studies
@@ -172,3 +173,16 @@ def test_readme_states_the_stored_results():
             f"| {added['mean']:+.1f} [{added['low']:+.1f}, {added['high']:+.1f}] |"
         )
         assert row in readme, f"README.md should have: {row}"
+
+
+def test_published_policy(results, agent, robot, tmp_path):
+    with pytest.raises(FileNotFoundError, match="folder of the authors' weights"):
+        studies.published_policy(robot, agent)
+    write_published(tmp_path, published_layers(), robot.name)
+    study = studies.published_policy(robot, agent, tmp_path, starts=1, episodes=2)
+    assert [(r["origin"], r["start"]) for r in study["records"]] == [
+        ("reference", None),
+        ("start", 0),
+    ]
+    assert all(len(r["returns"]) == 2 for r in study["records"])
+    assert studies.published_policy(robot, agent) == study
