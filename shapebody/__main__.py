@@ -8,6 +8,8 @@ import sys
 # It must be said before JAX starts.
 _FLAG = "--xla_cpu_multi_thread_eigen=false"
 
+_REPLACE = "replace the saved agent even if it has more steps"
+
 
 def main(arguments=None) -> int:
     parser = argparse.ArgumentParser(prog="python -m shapebody", description=__doc__)
@@ -22,7 +24,7 @@ def main(arguments=None) -> int:
     train.add_argument(
         "--state-only", action="store_true", help="leave the saved agent as it is; anneal later"
     )
-    train.add_argument("--engine", choices=("auto", "native", "mjx"), default="auto")
+    train.add_argument("--replace", action="store_true", help=_REPLACE)
 
     anneal = commands.add_parser(
         "anneal", help="save an agent from an unfinished run, after a last part at a falling rate"
@@ -30,6 +32,7 @@ def main(arguments=None) -> int:
     anneal.add_argument("agent")
     anneal.add_argument("--steps", type=int, default=1_640_000, help="of that part")
     anneal.add_argument("--hours", type=float, help="stop after this time; run again to continue")
+    anneal.add_argument("--replace", action="store_true", help=_REPLACE)
 
     sharpen = commands.add_parser(
         "sharpen", help="policy evaluation: a new critic for an agent's frozen policy"
@@ -53,11 +56,13 @@ def main(arguments=None) -> int:
     evaluate.add_argument("--start", type=int, help="start design number (default: the reference)")
     evaluate.add_argument("--episodes", type=int, default=200)
     evaluate.add_argument("--seed", type=int, default=0, help="of the episodes")
-    evaluate.add_argument("--engine", choices=("auto", "native", "mjx"), default="auto")
 
     validate = commands.add_parser("validate", help="what the method sees in a robot file")
     validate.add_argument("robot", help="an MJCF or URDF file, or a name in data/robots")
     validate.add_argument("--out", help="write the completed file to this MJCF file")
+
+    for command in (train, anneal, sharpen, evaluate):
+        command.add_argument("--engine", choices=("auto", "native", "mjx"), default="auto")
 
     options = parser.parse_args(arguments)
     if options.command == "validate":
@@ -75,9 +80,12 @@ def main(arguments=None) -> int:
             "design": _design,
             "evaluate": _evaluate,
         }[options.command](options)
-    except (ValueError, OSError) as error:
+    except (ValueError, OSError, ImportError) as error:
         print(f"shapebody: {error}", file=sys.stderr)
         return 1
+    except KeyboardInterrupt:
+        print("shapebody: interrupted", file=sys.stderr)
+        return 130
     return 0
 
 
@@ -91,8 +99,14 @@ def _train(options):
     config = TrainConfig.at_scale(options.scale or scale(), options.robots[0], **changes)
     config = as_continued(config)
     seconds = None if options.hours is None else 3600 * options.hours
-    limits = dict(max_steps=options.steps, max_seconds=seconds)
-    agent = train(config, engine=options.engine, state_only=options.state_only, **limits)
+    agent = train(
+        config,
+        max_steps=options.steps,
+        max_seconds=seconds,
+        engine=options.engine,
+        state_only=options.state_only,
+        replace=options.replace,
+    )
     if agent is not None:
         print(f"agent {agent.name}: {agent.metadata['steps']:,} steps")
 
@@ -101,7 +115,13 @@ def _anneal(options):
     from shapebody.ppo import anneal
 
     seconds = None if options.hours is None else 3600 * options.hours
-    agent = anneal(options.agent, options.steps, max_seconds=seconds)
+    agent = anneal(
+        options.agent,
+        options.steps,
+        max_seconds=seconds,
+        engine=options.engine,
+        replace=options.replace,
+    )
     if agent is None:
         print("not finished: the agent is as it was, the same command continues")
     else:
@@ -116,7 +136,7 @@ def _sharpen(options):
     agent = load_agent(options.agent)
     critic = CriticConfig() if agent.metadata["scale"] == "full" else CriticConfig.sharp()
     seconds = None if options.hours is None else 3600 * options.hours
-    sharper = train_critic(agent, critic, options.steps, max_seconds=seconds)
+    sharper = train_critic(agent, critic, options.steps, max_seconds=seconds, engine=options.engine)
     if sharper is agent:
         print("not finished: the agent is as it was, the same command continues")
 

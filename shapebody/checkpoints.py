@@ -1,4 +1,4 @@
-"""Trained agents on disk. No pickle; every file is written atomically.
+"""Trained agents on disk. No pickle; the files of an agent are replaced together.
 
 An agent is a folder:
 
@@ -35,7 +35,7 @@ import numpy as np
 import safetensors.numpy
 
 from .descriptions import Descriptions, Sizes
-from .files import atomic_write, load_arrays, read_safetensors, save_arrays
+from .files import atomic_write, atomic_write_all, load_arrays, read_safetensors, save_arrays
 from .locomotion.observations import Observation
 from .networks import (
     FOOT_OBSERVATION,
@@ -210,7 +210,7 @@ def save_agent(
     folder: str | Path | None = None,
     curve: Sequence[Mapping[str, Any]] | None = None,
 ) -> Path:
-    """Write an agent and return its folder.
+    """Write an agent and return its folder. An interruption leaves the agent that was there.
 
     Args:
         agent: the agent; versions, commit and machine are added to its metadata where missing.
@@ -243,17 +243,18 @@ def save_agent(
             f"metadata of agent {agent.name!r} cannot be written as JSON ({error}); use numbers, "
             "strings, lists and dictionaries, and None instead of NaN"
         ) from error
-    # The description comes last: an interruption before it leaves a mismatch that loading reports.
-    atomic_write(folder / WEIGHTS, safetensors.numpy.save(weights))
-    if states is None:
-        (folder / STATES).unlink(missing_ok=True)
-    else:
+    files = {folder / WEIGHTS: safetensors.numpy.save(weights)}
+    if states is not None:
         buffer = io.BytesIO()
         np.savez_compressed(buffer, **states)
-        atomic_write(folder / STATES, buffer.getvalue())
+        files[folder / STATES] = buffer.getvalue()
     if curve is not None:
-        atomic_write(folder / CURVE, _csv(curve))
-    atomic_write(folder / DESCRIPTION, text)
+        files[folder / CURVE] = _csv(curve)
+    # The description comes last: loading reports what does not match it.
+    files[folder / DESCRIPTION] = text
+    atomic_write_all(files)
+    if states is None:
+        (folder / STATES).unlink(missing_ok=True)
     return folder
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import secrets
+from collections.abc import Mapping
 from pathlib import Path
 
 import jax
@@ -16,19 +17,31 @@ import safetensors.numpy
 def atomic_write(path: str | Path, data: bytes | str) -> Path:
     """Write a file so that it is never seen half-written; its folder is created if needed."""
     path = Path(path)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    if isinstance(data, str):
-        data = data.encode()
-    temporary = path.with_name(f".{path.name}.{secrets.token_hex(4)}.tmp")
-    try:
-        with open(temporary, "xb") as file:
-            file.write(data)
-            file.flush()
-            os.fsync(file.fileno())
-        os.replace(temporary, path)
-    finally:
-        temporary.unlink(missing_ok=True)
+    atomic_write_all({path: data})
     return path
+
+
+def atomic_write_all(files: Mapping[Path, bytes | str]) -> None:
+    """Write files that belong together; their folders are created if needed.
+
+    All are written under temporary names first. Then they take their places at once, in the given
+    order: what is interrupted before leaves all the old files.
+    """
+    temporaries = {}
+    try:
+        for path, data in files.items():
+            path.parent.mkdir(parents=True, exist_ok=True)
+            temporary = path.with_name(f".{path.name}.{secrets.token_hex(4)}.tmp")
+            temporaries[temporary] = path
+            with open(temporary, "xb") as file:
+                file.write(data.encode() if isinstance(data, str) else data)
+                file.flush()
+                os.fsync(file.fileno())
+        for temporary, path in temporaries.items():
+            os.replace(temporary, path)
+    finally:
+        for temporary in temporaries:
+            temporary.unlink(missing_ok=True)
 
 
 def read_safetensors(path: Path, fix: str) -> dict[str, np.ndarray]:

@@ -17,6 +17,7 @@ import csv
 import hashlib
 import io
 import json
+import math
 import shutil
 import sys
 import time
@@ -96,12 +97,31 @@ class TrainConfig:
     """States kept for design search."""
 
     def __post_init__(self):
+        robots = (self.robots,) if isinstance(self.robots, str) else tuple(self.robots)
+        object.__setattr__(self, "robots", robots)
+        if not robots:
+            raise ValueError("robots is (); expected at least one name or path")
         if not self.name or Path(self.name).name != self.name:
             raise ValueError(
                 f"name is {self.name!r}; expected the name of a folder, without separators"
             )
-        robots = (self.robots,) if isinstance(self.robots, str) else tuple(self.robots)
-        object.__setattr__(self, "robots", robots)
+        counts = ("num_envs", "rollout_length", "total_steps", "minibatch_size", "epochs")
+        for name in (*counts, "state_bank"):
+            value = getattr(self, name)
+            if type(value) is not int or value < 1:
+                raise ValueError(f"{name} is {value!r}; expected a positive integer")
+        for name in ("discount", "gae_lambda", "value_lambda"):
+            value = getattr(self, name)
+            if not _is_number(value, 1) and (name, value) != ("value_lambda", None):
+                raise ValueError(f"{name} is {value!r}; expected a number from 0 to 1")
+        rates = self.learning_rate
+        rates = tuple(rates) if isinstance(rates, tuple | list) else ()
+        if len(rates) != 2 or not all(_is_number(rate, math.inf) for rate in rates):
+            raise ValueError(
+                f"learning_rate is {self.learning_rate!r}; expected two numbers of at least 0, "
+                "for the first and for the last step"
+            )
+        object.__setattr__(self, "learning_rate", rates)
         batch = self.num_envs * self.rollout_length
         if self.minibatch_size % self.rollout_length or batch % self.minibatch_size:
             raise ValueError(
@@ -182,6 +202,11 @@ class TrainConfig:
 def _default_name(robot: str, changes: dict) -> str:
     """Name of an agent: its robots' names, or those of their files, joined with "+"."""
     return "+".join(Path(str(name)).stem for name in changes.get("robots", (robot,)))
+
+
+def _is_number(value, high: float) -> bool:
+    """Whether a value is a finite number from 0 to `high`."""
+    return isinstance(value, int | float) and 0 <= value <= high and value < math.inf
 
 
 @jax.tree_util.register_dataclass
@@ -460,8 +485,12 @@ class Trainer:
     Args:
         config: the run.
         folder: the agent's folder; data/checkpoints/<name> if not given.
-        engine: see `Locomotion`.
+        engine: "native", "mjx" or "auto": that of the run in the folder or, if there is none, the
+            one that `Locomotion` chooses.
         policy: variables of a frozen policy, for the policy-evaluation phase.
+
+    Raises:
+        ValueError: if the run in the folder has another engine.
     """
 
     def __init__(self, config: TrainConfig, folder=None, engine: str = "auto", policy=None):
@@ -472,6 +501,7 @@ class Trainer:
         task = config.task
         if not config.learn_policy:
             task = replace(task, fixed_coefficient=True)
+        engine = _engine(self.folder, engine)
         self.env = Locomotion(robots, config.num_envs, engine=engine, config=task)
         self.policy, self.critic = Policy(config.policy), Critic(config.critic)
         self.update, start = make_update(config, self.policy, self.critic)
@@ -523,28 +553,33 @@ class Trainer:
         save_arrays(self.folder / "training.safetensors", self._everything())
 
     def start(self) -> bool:
-        """Resume from the folder, or start afresh; True if resumed."""
+        """Resume from the folder, or start afresh; True if resumed.
+
+        Raises:
+            ValueError: if the run in the folder is of another configuration, or its files are
+                damaged.
+        """
+        path = self.folder / "training.safetensors"
+        resumed = path.exists()
+        if resumed:
+            # Before the arrays are read, whose shapes depend on the configuration.
+            steps = _iterations(self.folder) * self.config.batch
+            about = self.folder / "training.json"
+            self.phases = _continued(about, self.config, steps, self.env.robots)
         coefficient = 0.0 if self.config.learn_policy else 1.0
         self.state = self.env.reset(self.key, coefficient=coefficient, spread=True)
         native = self.env.engine == "native"
         self.saved_physics = self.env.physics_arrays() if native else self.env.physics_state
-        path = self.folder / "training.safetensors"
-        if not path.exists():
-            if (self.folder / "agent.json").exists():
-                raise ValueError(
-                    f"{self.folder.name} has an agent but no training.safetensors to continue "
-                    "from; training anew would overwrite it: choose another name or folder"
-                )
+        if not resumed:
             robots = {robot.name: _robot_hash(robot) for robot in self.env.robots}
-            self.phases = [{"from_step": 0, "config": _plain(self.config), "robots": robots}]
+            first = {"from_step": 0, "config": _plain(self.config)}
+            self.phases = [first | {"robots": robots, "engine": self.env.engine}]
             return False
         saved = load_arrays(path, self._everything())
         self.learner, self.behaviour = saved["learner"], saved["behaviour"]
         self.state, self.seconds = saved["state"], float(saved["seconds"])
         self.saved_physics = saved["physics"]
         self.in_step = False
-        path = self.folder / "training.json"
-        self.phases = _continued(path, self.config, self.steps, self.env.robots)
         return True
 
     def agent(self, states=None) -> Agent:
@@ -614,12 +649,13 @@ class Trainer:
                 self.env.physics_state = self.saved_physics
         self.in_step = False
         curve = _Curve(self.folder / "training.csv", self.steps)
-        report = _Report(config, progress)
         # On an accelerator there is nothing to overlap: the device does one thing at a time.
         overlap = self.env.engine == "native"
         with ThreadPoolExecutor(1) as actor:
             state, trajectory = self._collect(self.behaviour, self.state, number)
-            began = mark = time.monotonic()
+            mark = time.monotonic()
+            until = mark + (math.inf if max_seconds is None else max_seconds)
+            report = _Report(last * config.batch, until, progress)
             while True:
                 # A snapshot from which the rollout below can be repeated.
                 self.state, self.behaviour = state, self.learner.policy
@@ -642,8 +678,7 @@ class Trainer:
                     curve.write(self.steps, self.seconds)
                 report.show(self.steps, curve)
                 self.save()
-                spent = max_seconds is not None and now - began >= max_seconds
-                if number >= last or spent:
+                if number >= last or now >= until:
                     break
                 if not overlap:
                     state, following = self._collect(self.behaviour, state, number)
@@ -692,29 +727,64 @@ def train(
     max_seconds: float | None = None,
     engine: str = "auto",
     state_only: bool = False,
+    replace: bool = False,
 ) -> Agent | None:
     """Train an agent, or continue its training, and save it.
+
+    An interrupt (Ctrl-C) ends the call early, with the agent of the last iteration; before the
+    first one there is nothing to save, and KeyboardInterrupt is raised.
 
     Args:
         config: the run, for example `TrainConfig.reduced("unitree_go2")`.
         folder: where the agent is kept; data/checkpoints/<name> by default. A run that was
             stopped there is continued exactly where it was.
         progress: print return, tracking error, curriculum coefficient, speed and time left.
-        max_steps, max_seconds: budgets of this call; the run can be continued later.
-        engine: "auto", "native" or "mjx".
+        max_steps: stop once this many steps in all have been consumed.
+        max_seconds: stop after this many seconds. After either, the run can be continued.
+        engine: "native", "mjx" or "auto", see `Trainer`.
         state_only: leave the agent in the folder as it is; the run can be annealed later.
+        replace: replace the agent in the folder even if it has more steps than the run.
 
     Returns:
         The agent, with its state bank; None with `state_only`.
+
+    Raises:
+        ValueError: if `max_steps` is less than one iteration, if the agent in the folder has more
+            steps than the run, or if the run there cannot be continued with `config`.
     """
+    if max_steps is not None and max_steps < config.batch:
+        raise ValueError(
+            f"max_steps is {max_steps}; one iteration is {config.batch} steps: give at least as "
+            "many, or a configuration with fewer environments"
+        )
     trainer = Trainer(config, folder, engine)
     trainer.start()
+    if not (state_only or replace):
+        others = ", state_only=True (--state-only) to leave it, or choose another name or folder"
+        _keep_agent(trainer.folder, trainer.steps, others)
     _run(trainer, progress, max_steps, max_seconds)
     return None if state_only else trainer.save_agent()
 
 
 STATE_FILES = ("training.safetensors", "training.json", "training.csv")
 """A run in its folder: its state, its configurations and its learning curve."""
+
+
+def _keep_agent(folder: Path, steps: int, others: str = "") -> None:
+    """Raise ValueError if the agent in a folder has more steps than the one to replace it."""
+    path = folder / "agent.json"
+    if not path.exists():
+        return
+    try:
+        kept = int(json.loads(path.read_text())["metadata"]["steps"])
+    except (ValueError, LookupError, TypeError):
+        kept = 0
+    # A run that is about to begin replaces no agent, not even one of unknown steps.
+    if kept > steps or steps == 0:
+        raise ValueError(
+            f"the agent in {folder} has {kept:,} steps, the run that would replace it {steps:,}; "
+            f"pass replace=True (--replace) to replace it{others}"
+        )
 
 
 def anneal(
@@ -725,6 +795,7 @@ def anneal(
     progress: bool = True,
     max_seconds: float | None = None,
     engine: str = "auto",
+    replace: bool = False,
 ) -> Agent | None:
     """Save a good agent from a run that is not at its end.
 
@@ -739,17 +810,20 @@ def anneal(
         folder: of the run, instead of data/checkpoints/<name>. The agent is saved there; the copy
             is in a folder in it until it is finished.
         progress, max_seconds, engine: see `train`. A copy that was stopped is continued.
+        replace: replace the agent in the folder even if it has more steps than the copy will have.
 
     Returns:
         The agent; None if the copy was stopped before its end, which leaves the old agent.
 
     Raises:
-        ValueError: if there is no such run, its files are damaged, or the copy that was stopped is
-            of another step of the run or has other settings.
+        ValueError: if there is no such run, its files are damaged, its rate is below `last_rate`,
+            the agent in the folder has more steps, or the copy that was stopped is of another step
+            of the run or has other settings.
     """
     folder = Path(folder) if folder else data_dir() / "checkpoints" / name
     copy = folder / "annealed"
-    config = _begin_annealing(folder, copy, steps, last_rate)
+    engine = _engine(folder, engine)
+    config = _begin_annealing(folder, copy, steps, last_rate, replace)
     trainer = Trainer(config, copy, engine)
     trainer.start()
     _run(trainer, progress, None, max_seconds)
@@ -760,7 +834,9 @@ def anneal(
     return agent
 
 
-def _begin_annealing(folder: Path, copy: Path, steps: int, last_rate: float) -> TrainConfig:
+def _begin_annealing(
+    folder: Path, copy: Path, steps: int, last_rate: float, replace: bool
+) -> TrainConfig:
     """Copy a run's files, with a new phase: `steps` more, and a rate that falls to `last_rate`.
 
     A copy that is there already stays. Returns the configuration of the new phase.
@@ -769,15 +845,19 @@ def _begin_annealing(folder: Path, copy: Path, steps: int, last_rate: float) -> 
     if missing:
         raise ValueError(f"there is no run to anneal in {folder.name}: {missing[0]} is missing")
     # The state is read first: curve rows that are newer than it do no harm.
-    fix = "restore it, or train anew"
     state = (folder / STATE_FILES[0]).read_bytes()
-    done = int(read_safetensors(folder / STATE_FILES[0], fix)["learner/iteration"])
+    done = _iterations(folder)
     phases = json.loads((folder / "training.json").read_text())
     config = dict(phases[-1]["config"])
     batch = config["num_envs"] * config["rollout_length"]
     first, last = config["learning_rate"]
     total = config["total_steps"] // batch
     rate = first + (last - first) * min(done / max(total, 1), 1.0)
+    if last_rate > rate:
+        raise ValueError(
+            f"last_rate is {last_rate:g}, above the present rate of the run, {rate:g}: give a "
+            "lower one"
+        )
     more = max(1, round(steps / batch))
     # Linear over the whole run, through the present rate now and the last one at the end.
     slope = (last_rate - rate) / more
@@ -785,6 +865,8 @@ def _begin_annealing(folder: Path, copy: Path, steps: int, last_rate: float) -> 
         "total_steps": (done + more) * batch,
         "learning_rate": [rate - slope * done, last_rate],
     }
+    if not replace:
+        _keep_agent(folder, config["total_steps"])
     phases.append({"from_step": done * batch, "config": config})
     if (copy / "training.safetensors").exists():
         if json.loads((copy / "training.json").read_text()) != phases:
@@ -823,7 +905,8 @@ def train_critic(
         steps: environment steps; 3 % of those that training takes at the agent's scale if not
             given, 1.5 million at `reduced`.
         folder: where the new agent is saved; data/checkpoints/<agent> by default, which replaces
-            the old critic there. The phase's own state and curve are in a folder in it.
+            the old critic there. The phase's own state and curve are in a folder in it, which
+            stays: a later call with more `steps` goes on from there.
         progress, max_seconds, engine: see `train`. A phase that was stopped is continued.
         changes: replace fields of the TrainConfig; by default gae_lambda is 0.95, and rollouts
             have at least 32 steps.
@@ -872,12 +955,19 @@ def train_critic(
 
 
 def _run(trainer: Trainer, progress, max_steps, max_seconds) -> None:
+    """Run until the end, a budget or an interrupt; raise an interrupt before anything was saved."""
     try:
         trainer.run(max_steps, max_seconds, progress)
     except KeyboardInterrupt:
-        # The training state on disk is whole; the learner's latest weights are kept as well.
-        if progress:
+        saved = (trainer.folder / "training.safetensors").exists()
+        if progress and saved:
             print("\ninterrupted: saved, the same call continues", flush=True)
+        elif progress:
+            print("\ninterrupted before the first iteration: nothing was saved", flush=True)
+        if not saved:
+            raise
+        # The learner may be an iteration ahead of the state on disk, where the next call begins.
+        trainer.start()
 
 
 def _plain(config: TrainConfig) -> dict:
@@ -928,13 +1018,41 @@ def as_continued(config: TrainConfig, folder=None) -> TrainConfig:
     return last if same else config
 
 
+def _iterations(folder: Path) -> int:
+    """Finished iterations of the run in a folder."""
+    state = read_safetensors(folder / "training.safetensors", "restore it, or train anew")
+    return int(state["learner/iteration"])
+
+
+def _engine(folder: Path, engine: str) -> str:
+    """The engine for a run in a folder: that of the run there, or `engine` if there is none.
+
+    Raises:
+        ValueError: if the run there has another engine than `engine`, which is not "auto".
+    """
+    if not (folder / "training.safetensors").exists():
+        return engine
+    try:
+        # A run that does not say so is older than the record and native.
+        own = json.loads((folder / "training.json").read_text())[0].get("engine", "native")
+    except (OSError, ValueError, LookupError, TypeError, AttributeError):
+        return engine  # a damaged file, which `Trainer.start` reports
+    if engine not in ("auto", own):
+        raise ValueError(
+            f"engine is {engine!r}, but the run in {folder.name} was begun with {own!r}, whose "
+            f"physics state no other engine can read: continue it with 'auto' or {own!r}, or begin "
+            "a run under another name"
+        )
+    return own
+
+
 def _robot_hash(robot) -> str:
     return hashlib.sha256(robot.xml.encode()).hexdigest()[:16]
 
 
 def _continued(path: Path, config: TrainConfig, steps: int, robots=()) -> list[dict]:
     """The phases of a run that goes on with `config`: a list of {"from_step", "config"}, the first
-    with hashes of the robots' files.
+    with hashes of the robots' files and the name of the engine.
 
     Raises:
         ValueError: if more than `CHANGEABLE`, or a robot's file, differs from the run in `path`.
@@ -1050,14 +1168,16 @@ class _Curve:
 
 
 class _Report:
-    """One progress line every few seconds, rewritten in place on a terminal."""
+    """One progress line every few seconds, rewritten in place on a terminal.
 
-    def __init__(self, config: TrainConfig, active: bool, interval: float = 5.0):
-        self.config, self.active = config, active
+    last: steps at which the call ends; until: time (`time.monotonic`) at which it does, if earlier.
+    """
+
+    def __init__(self, last: int, until: float, active: bool, interval: float = 5.0):
+        self.last, self.until, self.active = last, until, active
         self.interactive = sys.stdout.isatty() or "ipykernel" in sys.modules
         self.interval = interval if self.interactive else 12 * interval
         self.next = 0.0
-        self.speed = None
 
     def show(self, steps: int, curve: _Curve):
         now = time.monotonic()
@@ -1065,7 +1185,8 @@ class _Report:
             return
         self.next = now + self.interval
         row = curve.latest
-        left = (self.config.total_steps - steps) / max(row["steps_per_second"], 1e-9)
+        left = (self.last - steps) / max(row["steps_per_second"], 1e-9)
+        left = max(min(left, self.until - now), 0.0)
         ended = "no episode has ended yet"
         if "return" in row:
             ended = f"return {row['return']:6.2f}  xy error {row['tracking_error']:.3f} m/s"

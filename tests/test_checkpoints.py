@@ -134,6 +134,27 @@ def test_hash_depends_on_every_weight(agent):
     assert dataclasses.replace(agent, name="other").hash == agent.hash
 
 
+@pytest.mark.parametrize("what", ["np.savez_compressed", "os.fsync"])
+def test_an_interruption_leaves_the_old_agent(agent, folder, monkeypatch, what):
+    """While the states are compressed, and while the last file, the description, is written."""
+    other = dataclasses.replace(agent, policy=jax.tree.map(lambda x: 2 * x, agent.policy))
+    done, calls = {"np.savez_compressed": 0, "os.fsync": 2}[what], []
+
+    def interrupt(*args, **kwargs):
+        calls.append(args)
+        if len(calls) > done:
+            raise KeyboardInterrupt
+
+    monkeypatch.setattr(what.replace("np", "numpy"), interrupt)
+    with pytest.raises(KeyboardInterrupt):
+        save_agent(other, folder)
+    monkeypatch.undo()
+    assert load_agent(folder).hash == agent.hash
+    assert len(list(folder.iterdir())) == 3
+    save_agent(other, folder)
+    assert load_agent(folder).hash == other.hash != agent.hash
+
+
 def test_curve(agent, folder):
     assert not (folder / "curve.csv").exists()
     with pytest.raises(FileNotFoundError, match="no learning curve"):

@@ -167,6 +167,26 @@ def test_curriculum_accelerates_and_falls_back():
     assert not bool(curriculum.is_success(config, 0.1, 499, 1.0))
 
 
+@pytest.mark.parametrize("engine", ["native", pytest.param("mjx", marks=pytest.mark.slow)])
+def test_episodes_cut_short_leave_the_curriculum(go2, engine):
+    """One environment is cut after a step, one falls in it, one lasts until it is a success."""
+    config = TaskConfig(**QUIET, horizon=2, curriculum_length=2, curriculum_error=1e9)
+    env = Locomotion(go2, 3, config=config, engine=engine)
+    state = env.reset(jax.random.PRNGKey(0), coefficient=0.5)
+    height = np.asarray(state.descriptions.imu_height) * [1, 100, 1]
+    state = replace(
+        state,
+        descriptions=replace(state.descriptions, imu_height=jnp.asarray(height, jnp.float32)),
+        horizon=jnp.array([1, 2, 2], jnp.int32),
+        streak=jnp.array([3, 3, 3], jnp.int32),
+    )
+    state, trajectory = env.rollout(wave, None, state, jax.random.PRNGKey(0), 2)
+    np.testing.assert_array_equal(trajectory.truncated, [[1, 0, 0], [0, 0, 1]])
+    np.testing.assert_array_equal(trajectory.terminated, [[0, 1, 0], [0, 0, 0]])
+    np.testing.assert_array_equal(state.streak, [3, -1, 4])
+    np.testing.assert_allclose(state.coefficient, [0.5, 0.49, 0.54], rtol=1e-6)
+
+
 def test_commands_follow_their_distribution():
     config = TaskConfig()
     keys = jax.random.split(jax.random.PRNGKey(0), 20_000)

@@ -1,6 +1,8 @@
 """PPO: advantages, one update, exact resume, policy evaluation."""
 
+import time
 from dataclasses import replace
+from types import SimpleNamespace
 
 import jax
 import jax.numpy as jnp
@@ -64,16 +66,53 @@ def test_configurations():
         ppo.TrainConfig.at_scale("huge", "unitree_go2")
 
 
+@pytest.mark.parametrize(
+    "name, value",
+    [
+        ("robots", ()),
+        ("num_envs", -256),
+        ("rollout_length", 0),
+        ("total_steps", 0),
+        ("total_steps", 5e7),
+        ("minibatch_size", 0),
+        ("epochs", 0),
+        ("state_bank", 0),
+        ("discount", 2.0),
+        ("gae_lambda", 7),
+        ("gae_lambda", None),
+        ("value_lambda", 1.5),
+        ("value_lambda", float("nan")),
+        ("learning_rate", 4e-4),
+        ("learning_rate", (4e-4,)),
+        ("learning_rate", (4e-4, -1e-4)),
+        ("learning_rate", (4e-4, float("inf"))),
+    ],
+)
+def test_configurations_without_sense(name, value):
+    with pytest.raises(ValueError, match=f"{name} is .*; expected"):
+        ppo.TrainConfig.reduced("unitree_go2", **{name: value})
+
+
 @pytest.fixture(scope="module")
 def config():
     return ppo.TrainConfig.smoke("unitree_go2", total_steps=128 * 5)
 
 
+def begin(config, folder, engine="auto"):
+    """A trainer whose bodies differ, since it begins at c = 0.5; or the one to be continued."""
+    trainer = ppo.Trainer(config, folder, engine)
+    if not trainer.start():
+        env = trainer.env
+        trainer.state = env.reset(trainer.key, coefficient=0.5, spread=True)
+        native = env.engine == "native"
+        trainer.saved_physics = env.physics_arrays() if native else env.physics_state
+    return trainer
+
+
 @pytest.fixture(scope="module")
 def straight(config, tmp_path_factory):
     folder = tmp_path_factory.mktemp("straight")
-    trainer = ppo.Trainer(config, folder)
-    trainer.start()
+    trainer = begin(config, folder)
     trainer.run(max_steps=128 * 4, progress=False)
     return folder, trainer
 
@@ -85,17 +124,18 @@ def leaves(trainer):
 def test_resume_is_exact(config, straight, tmp_path):
     """Stopped twice, the run ends with the very weights of the uninterrupted one."""
     for steps in (128, 128 * 3, 128 * 4):
-        trainer = ppo.Trainer(config, tmp_path)
-        assert trainer.start() == (steps > 128)
+        trainer = begin(config, tmp_path)
+        assert trainer.in_step == (steps == 128)
         trainer.run(max_steps=steps, progress=False)
         assert trainer.steps == steps
+    designs = np.asarray(trainer.state.design)
+    assert np.all(np.abs(designs).max(1) > 0.3) and np.all(np.std(designs, 0)[:100] > 0.1)
     for a, b in zip(leaves(straight[1]), leaves(trainer), strict=True):
         np.testing.assert_array_equal(a, b)
 
 
 def test_a_run_goes_on_in_the_same_process(config, straight, tmp_path):
-    trainer = ppo.Trainer(config, tmp_path)
-    trainer.start()
+    trainer = begin(config, tmp_path)
     trainer.run(max_steps=128, progress=False)
     trainer.state_bank(rollouts=1)  # uses the same engine
     trainer.run(max_steps=128 * 4, progress=False)
@@ -121,6 +161,62 @@ def test_a_crash_while_saving_loses_nothing(config, straight, tmp_path, monkeypa
     assert again.start() and again.steps == 128
 
 
+def test_an_interrupt_saves_an_agent_only_after_an_iteration(config, tmp_path, monkeypatch, capsys):
+    with pytest.raises(ValueError, match="max_steps is 127; one iteration is 128 steps"):
+        ppo.train(config, tmp_path / "none", max_steps=127)
+    assert not (tmp_path / "none").exists()
+
+    def interrupt(*args):
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
+        patch.setattr(ppo.Trainer, "_collect", interrupt)
+        ppo.train(config, tmp_path)
+    assert capsys.readouterr().out.endswith("before the first iteration: nothing was saved\n")
+    assert not list(tmp_path.glob("agent.json")) + list(tmp_path.glob("*.safetensors"))
+    # In the third iteration, after the update and before the state is saved.
+    save = ppo.Trainer.save
+    monkeypatch.setattr(ppo.Trainer, "save", lambda t: interrupt() if t.steps > 256 else save(t))
+    agent = ppo.train(config, tmp_path)
+    assert capsys.readouterr().out.endswith("interrupted: saved, the same call continues\n")
+    assert agent.metadata["steps"] == 256 and load_agent(tmp_path).hash == agent.hash
+    monkeypatch.undo()
+    # The agent is that of the run as it is on disk, so the same call continues.
+    agent = ppo.train(config, tmp_path, progress=False, max_steps=384)
+    assert agent.metadata["steps"] == 384
+
+
+def test_an_agent_is_not_replaced_by_one_with_fewer_steps(config, tmp_path):
+    config = replace(config, num_envs=8, minibatch_size=32, epochs=1)
+    description = tmp_path / "agent.json"
+    description.write_text('{"metadata": {"steps": 34000}}')
+    arguments = dict(folder=tmp_path, progress=False)
+    with pytest.raises(ValueError, match=r"34,000 steps.* it 0;.*replace=True.*state_only=True"):
+        ppo.train(config, **arguments)
+    assert ppo.train(config, max_steps=64, state_only=True, **arguments) is None
+    with pytest.raises(ValueError, match=r"34,000 steps.* it 64;"):
+        ppo.train(config, **arguments)
+    assert "34000" in description.read_text()
+    agent = ppo.train(config, max_steps=128, replace=True, **arguments)
+    assert load_agent(tmp_path).hash == agent.hash
+
+
+def test_a_run_keeps_its_engine(config, straight, tmp_path, monkeypatch):
+    assert straight[1].phases[0]["engine"] == "native"
+    monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
+    assert ppo.Trainer(config, straight[0]).env.engine == "native"
+    with pytest.raises(ValueError, match="engine is 'mjx', but the run in .* with 'native'"):
+        ppo.Trainer(config, straight[0], "mjx")
+    with pytest.raises(ValueError, match="engine is 'mjx'"):
+        ppo.anneal(config.name, folder=straight[0], engine="mjx")
+    assert ppo._engine(tmp_path, "mjx") == "mjx"
+    (tmp_path / "training.safetensors").touch()
+    for phases, own in [("[{}]", "native"), ('[{"engine": "mjx"}, {}]', "mjx"), ("{", "auto")]:
+        (tmp_path / "training.json").write_text(phases)
+        assert ppo._engine(tmp_path, "auto") == own
+    assert ppo._engine(tmp_path, "mjx") == "mjx"
+
+
 def test_a_run_continues_only_with_its_own_configuration(config, tmp_path):
     trainer = ppo.Trainer(config, tmp_path)
     trainer.start()
@@ -137,9 +233,15 @@ def test_a_run_continues_only_with_its_own_configuration(config, tmp_path):
     assert ppo.as_continued(config, tmp_path / "nothing") == config
     other = replace(config, scale="full")
     assert ppo.as_continued(other, tmp_path) == other
-    wider = replace(config, policy=replace(config.policy, latent_scale=3.0))
+    scaled = replace(config, policy=replace(config.policy, latent_scale=3.0))
     with pytest.raises(ValueError, match=r"policy.latent_scale was 1.0, is 3.0.*as_continued"):
+        ppo.Trainer(scaled, tmp_path).start()
+    # The field is named even where the arrays have other shapes.
+    wider = replace(config, policy=replace(config.policy, core_widths=(12, 8)))
+    with pytest.raises(ValueError, match=r"core_widths was \[16, 8\], is \[12, 8\]"):
         ppo.Trainer(wider, tmp_path).start()
+    with pytest.raises(ValueError, match="num_envs was 16, is 32"):
+        ppo.Trainer(replace(config, num_envs=32), tmp_path).start()
     # A run that is older than a setting goes on with the setting's default.
     for phase in longer.phases:
         del phase["config"]["task"]["design_radius"]
@@ -154,9 +256,6 @@ def test_a_run_continues_only_with_its_own_configuration(config, tmp_path):
         longer.start()
     (tmp_path / "training.safetensors").rename(tmp_path / "gone")
     assert ppo.as_continued(config, tmp_path) == config  # a new run, with today's settings
-    (tmp_path / "agent.json").write_text("{}")
-    with pytest.raises(ValueError, match="would overwrite"):
-        longer.start()
 
 
 def test_annealing_leaves_the_run_as_it_is(config, tmp_path, monkeypatch):
@@ -187,6 +286,14 @@ def test_annealing_leaves_the_run_as_it_is(config, tmp_path, monkeypatch):
     assert np.interp(2 / 5, [0, 1], [first, last]) == pytest.approx(rate)
     rows = load_curve(tmp_path)
     assert rows["steps"][-1] == 5 * config.batch
+    with pytest.raises(ValueError, match="agent .* has 320 steps, the run that would .* it 192"):
+        ppo.anneal("walker", **arguments | {"steps": config.batch})
+    with pytest.raises(ValueError, match="last_rate is 0.01, above the present rate"):
+        ppo.anneal("walker", **arguments | {"last_rate": 1e-2})
+    assert not (tmp_path / "annealed").exists() and load_agent(tmp_path).hash == agent.hash
+    arguments |= {"steps": 2 * config.batch, "replace": True}
+    assert ppo.anneal("walker", max_seconds=0.0, **arguments) is None
+    assert (tmp_path / "annealed" / "training.safetensors").exists()
 
 
 def test_state_only_saves_no_agent(config, tmp_path):
@@ -349,6 +456,8 @@ def test_train_and_policy_evaluation(config, tmp_path):
     assert sharper.policy_hash == loaded.policy_hash
     again = ppo.train_critic(sharper, small, **arguments)
     assert again.hash == sharper.hash
+    longer = ppo.train_critic(sharper, small, **arguments | {"steps": 384})
+    assert longer.metadata["policy_evaluation"]["steps"] == 384
     for a, b in zip(jax.tree.leaves(agent.policy), jax.tree.leaves(sharper.policy), strict=True):
         np.testing.assert_array_equal(a, b)
     assert sharper.critic_config.heads == 3 and sharper.metadata["steps"] == 128
@@ -359,12 +468,27 @@ def test_train_and_policy_evaluation(config, tmp_path):
     assert np.all(np.asarray(sharper.states.privileged)[:, 4] == 1.0)
 
 
+def test_the_time_left_is_that_of_the_call(capsys):
+    def left(last, seconds):
+        curve = SimpleNamespace(latest=dict(steps_per_second=100.0, coefficient=0.0))
+        ppo._Report(last, time.monotonic() + seconds + 0.5, True).show(4_000, curve)
+        return capsys.readouterr().out.split()[-2]
+
+    assert left(64_000, float("inf")) == "10m00"
+    assert left(64_000, 120) == "2m00"
+    assert left(64_000, -1) == "0m00"
+
+
 @pytest.mark.slow
 def test_training_on_mjx_resumes(tmp_path):
+    """The run that was stopped ends with the very weights of the uninterrupted one."""
     config = ppo.TrainConfig.smoke("unitree_go2", num_envs=4, minibatch_size=32)
-    for steps in (32, 64):
-        trainer = ppo.Trainer(config, tmp_path, engine="mjx")
-        assert trainer.start() == (steps > 32)
+    straight = begin(config, tmp_path / "straight", "mjx")
+    straight.run(max_steps=96, progress=False)
+    for steps in (32, 96):
+        trainer = begin(config, tmp_path / "stopped", "mjx" if steps == 32 else "auto")
+        assert trainer.in_step == (steps == 32) and trainer.env.engine == "mjx"
         trainer.run(max_steps=steps, progress=False)
-    assert trainer.steps == 64
-    assert all(np.isfinite(x).all() for x in leaves(trainer))
+    assert trainer.steps == 96 and np.any(np.asarray(trainer.state.design))
+    for a, b in zip(leaves(straight), leaves(trainer), strict=True):
+        np.testing.assert_array_equal(a, b)

@@ -84,7 +84,8 @@ class TaskConfig:
     curriculum_error: float = 0.4
     """Success needs a mean velocity error per axis of at most this x the command limit ..."""
     curriculum_length: int = 500
-    """... and at least this many control steps."""
+    """... and at least this many control steps. A fall before them is a failure; an episode that is
+    cut before them without one leaves c as it is."""
 
     def __post_init__(self):
         if self.action_delay not in (None, 0, 1):

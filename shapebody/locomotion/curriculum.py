@@ -3,12 +3,22 @@
 The paper refers to earlier work for the rule; this is the rule of the authors' earlier environment.
 
 Each environment has its own c. A streak of successful episodes raises it faster and
-faster, a streak of failures lowers it likewise, by streak / `curriculum_levels`.
+faster, a streak of failures lowers it likewise, by streak / `curriculum_levels`. Added here:
+an episode that is cut before `curriculum_length` without a fall is neither, as are many of a
+batch's first ones, whose horizons are staggered.
 """
 
 import jax.numpy as jnp
 
 from shapebody.locomotion.config import TaskConfig
+
+
+def is_conclusive(config: TaskConfig, length, terminated):
+    """Whether an episode counts: it fell, or lasted long enough for a success.
+
+    length: control steps; terminated: whether it ended in a fall.
+    """
+    return terminated | (length >= config.curriculum_length)
 
 
 def is_success(config: TaskConfig, mean_error, length, command_limit):

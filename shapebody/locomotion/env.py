@@ -219,7 +219,9 @@ class Locomotion:
         parts = [group.read(*out) for group, out in zip(self.groups, raw, strict=True)]
         readings = jax.tree.map(lambda *x: jnp.concatenate(x), *parts)
         state, outcome = jax.vmap(partial(episodes.advance, self.config))(state, readings)
-        coefficient, streak = jax.vmap(partial(episodes.next_coefficient, self.config))(state)
+        coefficient, streak = jax.vmap(partial(episodes.next_coefficient, self.config))(
+            state, outcome.terminated
+        )
         return state, outcome, (coefficient, streak, _next_key(state.key))
 
     # ------------------------------------------------------------------ reset

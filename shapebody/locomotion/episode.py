@@ -200,11 +200,17 @@ def advance(config: TaskConfig, episode: Episode, readings: Readings):
     return episode, Outcome(reward, terms, terminated, truncated, finite)
 
 
-def next_coefficient(config: TaskConfig, episode: Episode):
-    """(coefficient, streak) for the episode that follows a finished one."""
+def next_coefficient(config: TaskConfig, episode: Episode, terminated):
+    """(coefficient, streak) for the episode that follows a finished one.
+
+    terminated: bool, whether the finished one ended in a fall.
+    """
+    old = episode.coefficient, episode.streak
     if config.fixed_coefficient:
-        return episode.coefficient, episode.streak
+        return old
     mean_error = episode.total_error / jnp.maximum(episode.step, 1)
     limit = randomization.command_limit(config, episode.descriptions)
     success = curriculum.is_success(config, mean_error, episode.step, limit)
-    return curriculum.update(config, episode.coefficient, episode.streak, success)
+    new = curriculum.update(config, *old, success)
+    conclusive = curriculum.is_conclusive(config, episode.step, terminated)
+    return tuple(jnp.where(conclusive, *pair) for pair in zip(new, old, strict=True))

@@ -1,0 +1,56 @@
+"""The command line: what reaches the functions behind it, and what is said of errors."""
+
+import sys
+from dataclasses import replace
+
+import pytest
+from tiny import tiny_agent, tiny_robot
+
+from shapebody import ppo
+from shapebody.__main__ import main
+from shapebody.checkpoints import save_agent
+
+
+@pytest.fixture(scope="module")
+def files(tmp_path_factory):
+    """Paths of a robot's file and of the folder of an agent for it."""
+    folder = tmp_path_factory.mktemp("robot")
+    agent = replace(tiny_agent(tiny_robot(folder)), metadata={"scale": "smoke"})
+    return str(folder / "legs_2.xml"), str(save_agent(agent, folder / "agent"))
+
+
+def test_a_missing_optional_package_is_one_line(files, monkeypatch, capsys):
+    monkeypatch.setitem(sys.modules, "botorch", None)
+    robot, agent = files
+    assert main(["design", robot, "--agent", agent, "--method", "bo"]) == 1
+    error = capsys.readouterr().err
+    assert error.startswith("shapebody: method 'bo' needs") and error.count("\n") == 1
+
+
+def test_options_of_training(files, monkeypatch):
+    robot, agent = files
+    monkeypatch.setenv("XLA_FLAGS", "")  # which `main` sets
+    calls = []
+    monkeypatch.setattr(ppo, "train", lambda config, **given: calls.append(given))
+    monkeypatch.setattr(ppo, "anneal", lambda name, steps, **given: calls.append(given))
+    monkeypatch.setattr(ppo, "train_critic", lambda *unnamed, **given: calls.append(given))
+    options = ["--engine", "mjx", "--hours", "2"]
+    assert main(["train", robot, "--replace", "--steps", "9", *options]) == 0
+    assert main(["anneal", "any", "--replace", *options]) == 0
+    assert main(["anneal", "any"]) == 0
+    assert main(["sharpen", agent, *options]) == 0
+    given = dict(max_seconds=7200, engine="mjx", replace=True)
+    assert calls[0] == given | dict(max_steps=9, state_only=False)
+    assert calls[1] == given
+    assert calls[2] == dict(max_seconds=None, engine="auto", replace=False)
+    assert calls[3] == dict(max_seconds=7200, engine="mjx")
+
+
+def test_an_interrupt_is_no_traceback(monkeypatch, capsys):
+    def interrupt(*args, **kwargs):
+        raise KeyboardInterrupt
+
+    monkeypatch.setenv("XLA_FLAGS", "")
+    monkeypatch.setattr(ppo, "anneal", interrupt)
+    assert main(["anneal", "any"]) == 130
+    assert capsys.readouterr().err == "shapebody: interrupted\n"
