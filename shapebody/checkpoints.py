@@ -35,7 +35,14 @@ import numpy as np
 import safetensors.numpy
 
 from .descriptions import Descriptions, Sizes
-from .files import atomic_write, atomic_write_all, load_arrays, read_safetensors, save_arrays
+from .files import (
+    atomic_write,
+    atomic_write_all,
+    load_arrays,
+    read_curve,
+    read_safetensors,
+    save_arrays,
+)
 from .locomotion.observations import Observation
 from .networks import (
     FOOT_OBSERVATION,
@@ -315,23 +322,14 @@ def load_agent(name_or_folder: str | Path) -> Agent:
 
 
 def load_curve(name_or_folder: str | Path) -> dict[str, np.ndarray]:
-    """Columns of an agent's learning curve; numbers as float64, NaN where a cell is empty.
+    """Columns of an agent's learning curve (`files.read_curve`).
 
     Raises FileNotFoundError if the agent has none.
     """
     path = _find(name_or_folder) / CURVE
     if not path.is_file():
         raise FileNotFoundError(f"{path} does not exist: this agent has no learning curve")
-    with open(path, newline="", encoding="utf-8") as file:
-        rows = list(csv.DictReader(file))
-    columns = {}
-    for name in rows[0] if rows else ():
-        cells = [row[name] for row in rows]
-        try:
-            columns[name] = np.array([float(cell) if cell else np.nan for cell in cells])
-        except ValueError:
-            columns[name] = np.array(cells)
-    return columns
+    return read_curve(path)
 
 
 def check_agent(agent: Agent) -> None:

@@ -5,9 +5,11 @@ import os
 import time
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
+from pathlib import Path
 
 import numpy as np
 
+from shapebody.files import atomic_write
 from shapebody.paths import data_dir
 
 
@@ -144,7 +146,7 @@ def result_in_parts(
         {"records": those of `parts`, in that order, "provenance": {...}}; "seconds" there is the
         sum over these parts.
     """
-    path, kept = _result_path(name), scale() != "smoke"
+    path, kept = result_path(name), scale() != "smoke"
     known = _known_parts(path, agent, config, recompute) if kept else {}
     another = kept and not known and path.exists()
     for number, (part, compute) in enumerate(parts.items(), 1):
@@ -155,13 +157,10 @@ def result_in_parts(
         source = provenance(agent, time.perf_counter() - began, **config)
         known[part] = {"records": records, "provenance": source}
         if kept:
-            path.parent.mkdir(parents=True, exist_ok=True)
-            temporary = path.with_name(path.name + ".tmp")
-            temporary.write_text(_one_record_per_line(known))
             if another:
                 _set_aside(path)
                 another = False
-            os.replace(temporary, path)
+            atomic_write(path, _one_record_per_line(known))
         if progress:
             seconds = source["seconds"]
             print(f"{number} of {len(parts)}: {part}, {seconds:.0f} s", flush=True)
@@ -188,17 +187,18 @@ def _set_aside(path) -> None:
         number += 1
         old = path.with_suffix(f".old{number}.json")
     os.replace(path, old)
-    print(f"{path.name} was of another agent or other settings: kept as {old.name}")
+    print(f"{path.name} was of another agent or other settings, or damaged: kept as {old.name}")
 
 
 def stored_parts(name: str, agent=None, **config) -> list[str]:
     """Names of the parts that `result_in_parts` would load for these arguments."""
     if scale() == "smoke":
         return []
-    return list(_known_parts(_result_path(name), agent, config, overwrite=False))
+    return list(_known_parts(result_path(name), agent, config, overwrite=False))
 
 
-def _result_path(name: str):
+def result_path(name: str) -> Path:
+    """Where `result` keeps that experiment at the scale in force."""
     suffix = "" if scale() == "reduced" else f"_{scale()}"
     return data_dir() / "results" / f"{name}{suffix}.json"
 

@@ -10,7 +10,6 @@ import gzip
 import html
 import importlib.util
 import json
-import os
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -18,6 +17,7 @@ import mujoco
 import numpy as np
 
 from shapebody import drawing, video
+from shapebody.files import atomic_write
 
 _ROOT = "/robot"
 _LOOP_BACK_AND_FORTH = 2202  # THREE.LoopPingPong
@@ -48,11 +48,7 @@ class Scene:
 
     def save(self, path: str | Path) -> Path:
         """Write the page to a file that any browser opens."""
-        path = Path(path)
-        temporary = path.with_name(path.name + ".tmp")
-        temporary.write_text(self.static_html(), encoding="utf-8")
-        os.replace(temporary, path)
-        return path
+        return atomic_write(path, self.static_html())
 
     def _repr_html_(self) -> str:
         packed = gzip.compress(self.static_html().encode(), mtime=0)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import csv
 import os
 import secrets
 from collections.abc import Mapping
@@ -42,6 +43,24 @@ def atomic_write_all(files: Mapping[Path, bytes | str]) -> None:
     finally:
         for temporary in temporaries:
             temporary.unlink(missing_ok=True)
+
+
+def read_curve(path: str | Path) -> dict[str, np.ndarray]:
+    """Columns of a learning curve (`curve.csv` of an agent), float64, NaN where a cell is empty.
+
+    Raises ValueError if it holds no rows, or text where a number should be.
+    """
+    with open(path, newline="", encoding="utf-8") as file:
+        rows = list(csv.DictReader(file))
+    if not rows:
+        raise ValueError(f"{path} holds no rows; expected a header and one line per record")
+    try:
+        return {
+            name: np.array([float(row[name]) if row[name] else np.nan for row in rows])
+            for name in rows[0]
+        }
+    except (TypeError, ValueError) as error:
+        raise ValueError(f"{path} is no learning curve ({error})") from error
 
 
 def read_safetensors(path: Path, fix: str) -> dict[str, np.ndarray]:

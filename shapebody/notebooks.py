@@ -7,7 +7,6 @@ from run to run by itself (times, versions of the kernel, widget states).
 """
 
 import argparse
-import os
 import re
 import sys
 import tempfile
@@ -15,6 +14,8 @@ import time
 from pathlib import Path
 
 import nbformat
+
+from shapebody.files import atomic_write
 
 LONGEST_CELL = 30
 """Lines of code."""
@@ -50,9 +51,7 @@ def execute(path: str | Path, timeout: float | None = None) -> float:
     client.execute()
     seconds = time.perf_counter() - start
     normalise(notebook)
-    temporary = path.with_name(path.name + ".tmp")
-    nbformat.write(notebook, temporary)
-    os.replace(temporary, path)
+    atomic_write(path, nbformat.writes(notebook) + "\n")
     return seconds
 
 

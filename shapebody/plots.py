@@ -1,6 +1,5 @@
 """House style of the figures, learning curves, and the table "paper | ours"."""
 
-import csv
 import html
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
@@ -9,6 +8,8 @@ from pathlib import Path
 import matplotlib as mpl
 import matplotlib.pyplot as plt
 import numpy as np
+
+from shapebody.files import read_curve
 
 # Okabe and Ito's colours stay distinct for colour-blind readers.
 COLOURS = {
@@ -49,18 +50,6 @@ def use_style() -> None:
             "svg.hashsalt": "shapebody",
         }
     )
-
-
-def read_curve(path: str | Path) -> dict[str, np.ndarray]:
-    """Columns of a learning curve (`curve.csv` of an agent) as float arrays of one length."""
-    with open(path, newline="", encoding="utf-8") as file:
-        rows = list(csv.DictReader(file))
-    if not rows:
-        raise ValueError(f"{path} holds no rows; expected a header and one line per record")
-    return {
-        name: np.array([float(row[name]) if row[name] else np.nan for row in rows])
-        for name in rows[0]
-    }
 
 
 def learning_curve(path: str | Path, y: str, x: str = "steps", ax=None, smooth: int = 1, **style):

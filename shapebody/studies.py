@@ -13,7 +13,13 @@ import numpy as np
 from shapebody import paper
 from shapebody.design import DesignSpace
 from shapebody.evaluation import EvaluationConfig, evaluate, paired_gain
-from shapebody.experiments import result, result_in_parts, stored_parts, stored_result
+from shapebody.experiments import (
+    result,
+    result_in_parts,
+    result_path,
+    stored_parts,
+    stored_result,
+)
 from shapebody.locomotion import TaskConfig
 from shapebody.paths import data_dir
 from shapebody.published import load_published_policy
@@ -42,6 +48,8 @@ SINGLE_ROBOT_RUNS = (
     Run("vgds", 100.0, "reference"),
 )
 """What the critic adds to the pull of the trust region, from afar and from the reference."""
+FRESH_RUNS = (CONTROL, *(Run("vgds", value) for value in (20.0, 50.0, 100.0, 200.0)))
+"""To be repeated from other start designs than the paper's, which have decided nothing."""
 METHOD_RUNS = (CONTROL, *(Run(name) for name in METHODS if name != "penalty-only"))
 """All methods at the paper's λ (Section 4.1, Appendix C)."""
 
@@ -55,6 +63,7 @@ def design_study(
     horizon: int = 1000,
     seed: int = 0,
     iterations: int | None = None,
+    first_start: int = 0,
     recompute: bool = False,
     progress: bool = False,
 ) -> dict:
@@ -70,6 +79,8 @@ def design_study(
         episodes: evaluation episodes per design.
         seed: of the searches and of the evaluation.
         iterations: of every search; the paper's number for each method if not given.
+        first_start: number of the first start design. The paper's are 0 to 9; others have a file
+            of their own.
         recompute: search and evaluate anew.
         progress: print a line per run.
 
@@ -85,9 +96,9 @@ def design_study(
     Raises:
         ValueError: for a run or a setting that cannot be, before anything is computed.
     """
-    setting = dict(starts=starts, episodes=episodes, horizon=horizon, seed=seed)
+    setting = _setting(starts, episodes, horizon, seed, first_start)
     for name, value in setting.items():
-        least = 0 if name == "seed" else 1
+        least = 0 if name in ("seed", "first_start") else 1
         if not isinstance(value, numbers.Integral) or value < least:
             raise ValueError(f"{name} is {value!r}; expected an integer of at least {least}")
     for run in runs:
@@ -96,7 +107,14 @@ def design_study(
     parts = {"starts and reference": partial(_initial_records, agent, robot, **setting)}
     for run in runs:
         parts[_part(run)] = partial(_run_records, agent, robot, run, short, **setting)
-    return result_in_parts(_file(robot), parts, agent, recompute, progress, **setting, **short)
+    name = _file(robot, first_start)
+    return result_in_parts(name, parts, agent, recompute, progress, **setting, **short)
+
+
+def _setting(starts, episodes, horizon, seed, first_start) -> dict:
+    """What a stored study depends on; `first_start` is named only where it is not 0."""
+    setting = dict(starts=starts, episodes=episodes, horizon=horizon, seed=seed)
+    return setting if first_start == 0 else setting | {"first_start": first_start}
 
 
 def _validate(run: Run) -> None:
@@ -111,8 +129,9 @@ def _validate(run: Run) -> None:
         raise ValueError(f"trust_region is {value!r} in {run}; expected a number of at least 0")
 
 
-def _file(robot) -> str:
-    return f"design_study_{robot.name}"
+def _file(robot, first_start: int) -> str:
+    suffix = f"_starts_from_{first_start}" if first_start else ""
+    return f"design_study_{robot.name}{suffix}"
 
 
 def _part(run: Run) -> str:
@@ -137,15 +156,17 @@ def available(
     horizon: int = 1000,
     seed: int = 0,
     iterations: int | None = None,
+    first_start: int = 0,
     recompute: bool = False,
 ) -> tuple[Run, ...]:
     """Those of `runs` that `design_study` can return here for the same arguments.
 
     All but "bo" always; "bo" where its libraries are `installed`, or where its part is stored.
     """
-    setting = dict(starts=starts, episodes=episodes, horizon=horizon, seed=seed)
+    setting = _setting(starts, episodes, horizon, seed, first_start)
     short = {} if iterations is None else {"iterations": iterations}
-    stored = [] if recompute else stored_parts(_file(robot), agent, **setting, **short)
+    name = _file(robot, first_start)
+    stored = [] if recompute else stored_parts(name, agent, **setting, **short)
     here = installed(runs)
     return tuple(run for run in runs if run in here or _part(run) in stored)
 
@@ -154,25 +175,28 @@ CURVE_POINTS = 21
 """Iterations of a search at which its record holds the objective."""
 
 
-def _origins(space, origin: str, starts: int):
-    if origin == "reference":
-        return space.reference[None]
-    return np.stack([space.start(i) for i in range(starts)])
-
-
-def _initial_records(agent, robot, starts, **setting):
+def _origins(robot, run: Run, starts: int, first_start: int):
+    """Numbers of the start designs (None for the reference), and the designs [n, d]."""
     space = DesignSpace(robot)
-    run = Run("none", None)
-    records = _evaluated(agent, robot, run, _origins(space, "start", starts), **setting)
-    run = run._replace(origin="reference")
-    return records + _evaluated(agent, robot, run, _origins(space, "reference", 1), **setting)
+    if run.origin == "reference":
+        return [None], space.reference[None]
+    numbers = list(range(first_start, first_start + starts))
+    return numbers, np.stack([space.start(i) for i in numbers])
 
 
-def _run_records(agent, robot, run: Run, short, starts, seed, **setting):
-    initial = _origins(DesignSpace(robot), run.origin, starts)
+def _initial_records(agent, robot, starts, first_start=0, **setting):
+    records = []
+    for run in (Run("none", None), Run("none", None, "reference")):
+        numbers, designs = _origins(robot, run, starts, first_start)
+        records += _evaluated(agent, robot, run, numbers, designs, **setting)
+    return records
+
+
+def _run_records(agent, robot, run: Run, short, starts, seed, first_start=0, **setting):
+    numbers, initial = _origins(robot, run, starts, first_start)
     given = 100.0 if run.trust_region is None else run.trust_region
     found = search(run.method, agent, robot, initial, trust_region=given, seed=seed, **short)
-    records = _evaluated(agent, robot, run, found.design, seed=seed, **setting)
+    records = _evaluated(agent, robot, run, numbers, found.design, seed=seed, **setting)
     last = len(found.trajectory) - 1
     rows = np.unique(np.linspace(0, last, CURVE_POINTS).round().astype(int))
     # BO scores some designs before its first iteration.
@@ -193,14 +217,14 @@ def _run_records(agent, robot, run: Run, short, starts, seed, **setting):
     return records
 
 
-def _evaluated(agent, robot, run: Run, designs, seed, episodes, horizon):
-    """A record per design; designs of one run differ in the start they came from."""
+def _evaluated(agent, robot, run: Run, numbers, designs, seed, episodes, horizon):
+    """A record per design; `numbers` are those of the start designs they came from."""
     predicted = Objective.of(agent, robot, 0.0).value(designs)
     score = evaluate(agent, robot, designs, seed=seed, config=_evaluation(episodes, horizon))
     return [
         {
             "origin": run.origin,
-            "start": i if run.origin == "start" else None,
+            "start": numbers[i],
             "method": run.method,
             "trust_region": run.trust_region,
             "return": float(score.returns[i].mean()),
@@ -345,13 +369,14 @@ def published_policy(robot, agent, folder=None, starts: int = 10, episodes: int 
         FileNotFoundError: if nothing is stored and no folder is given.
     """
     name = f"published_policy_{robot.name}"
-    path = data_dir() / "results" / f"{name}.json"
     if folder is None:
-        if not path.exists():
-            raise FileNotFoundError(
-                f"{path.name} is not in data/results; give the folder of the authors' weights"
-            )
-        return stored_result(path)
+        # Theirs is the same policy at all scales.
+        for path in (result_path(name), data_dir() / "results" / f"{name}.json"):
+            if path.exists():
+                return stored_result(path)
+        raise FileNotFoundError(
+            f"{path.name} is not in data/results; give the folder of the authors' weights"
+        )
 
     def compute():
         module, variables = load_published_policy(folder, robot.name)

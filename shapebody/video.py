@@ -23,6 +23,7 @@ import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
 from shapebody import drawing
+from shapebody.files import atomic_write
 
 SHOWN_GROUPS = (0, 1, 2)
 """Geom groups in pictures; collision spheres are in group 5."""
@@ -576,7 +577,4 @@ def save_video(path: str | Path, frames: np.ndarray, fps: float = 25.0) -> Path:
     """Write a clip; the suffix becomes .gif where ffmpeg is missing. Returns the path written."""
     kind, data = encode_video(frames, fps)
     path = Path(path).with_suffix(".mp4" if kind == "video/mp4" else ".gif")
-    temporary = path.with_name(path.name + ".tmp")
-    temporary.write_bytes(data)
-    os.replace(temporary, path)
-    return path
+    return atomic_write(path, data)

@@ -159,7 +159,7 @@ def test_curve(agent, folder):
     assert not (folder / "curve.csv").exists()
     with pytest.raises(FileNotFoundError, match="no learning curve"):
         load_curve(folder)
-    rows = [{"steps": 10, "return": np.float32(1.5)}, {"steps": 20, "note": "x"}]
+    rows = [{"steps": 10, "return": np.float32(1.5)}, {"steps": 20, "std": 0.5}]
     save_agent(agent, folder, curve=rows)
     before = (folder / "curve.csv").read_bytes()
     save_agent(agent, folder)
@@ -167,7 +167,10 @@ def test_curve(agent, folder):
     curve = load_curve(folder)
     np.testing.assert_array_equal(curve["steps"], [10, 20])
     np.testing.assert_array_equal(curve["return"], [1.5, np.nan])
-    assert list(curve["note"]) == ["", "x"]
+    np.testing.assert_array_equal(curve["std"], [np.nan, 0.5])
+    (folder / "curve.csv").write_text("steps,return\n10,many\n")
+    with pytest.raises(ValueError, match="no learning curve .*'many'"):
+        load_curve(folder)
 
 
 def test_names(agent, tmp_path, monkeypatch):

@@ -112,6 +112,28 @@ def test_what_is_stored_is_not_computed_again(results, agent, robot, monkeypatch
     assert len(json.loads(path.read_text())["parts"]) == 4
 
 
+def test_other_starts_have_their_own_file(results, agent, robot):
+    runs = (CONTROL, Run("vgds", 20.0))
+    own = design_study(agent, robot, runs, **dict(SETTING, starts=3))["records"]
+    path = results / f"design_study_{robot.name}.json"
+    before = path.read_bytes()
+    other = design_study(agent, robot, runs, first_start=2, **dict(SETTING, starts=1))["records"]
+    assert [r["start"] for r in other] == [2, None, 2, 2]
+    assert path.read_bytes() == before
+    stored = json.loads((results / f"design_study_{robot.name}_starts_from_2.json").read_text())
+    assert all(
+        part["provenance"]["config"]["first_start"] == 2 for part in stored["parts"].values()
+    )
+    # The same start, searched and evaluated in another batch.
+    same = [r for r in own if r["start"] == 2]
+    for mine, one in zip(same, (other[0], *other[2:]), strict=True):
+        assert (mine["method"], mine["trust_region"]) == (one["method"], one["trust_region"])
+        assert mine["predicted_value"] == pytest.approx(one["predicted_value"], abs=1e-3)
+    assert studies.gain(studies.gains(other), "vgds", "penalty-only", 20.0)["pairs"] == 1
+    with pytest.raises(ValueError, match="first_start is -1; expected an integer of at least 0"):
+        design_study(agent, robot, runs, first_start=-1, **SETTING)
+
+
 @pytest.mark.parametrize(
     "run, message",
     [
@@ -175,7 +197,7 @@ def test_readme_states_the_stored_results():
         assert row in readme, f"README.md should have: {row}"
 
 
-def test_published_policy(results, agent, robot, tmp_path):
+def test_published_policy(results, agent, robot, tmp_path, monkeypatch):
     with pytest.raises(FileNotFoundError, match="folder of the authors' weights"):
         studies.published_policy(robot, agent)
     write_published(tmp_path, published_layers(), robot.name)
@@ -185,4 +207,6 @@ def test_published_policy(results, agent, robot, tmp_path):
         ("start", 0),
     ]
     assert all(len(r["returns"]) == 2 for r in study["records"])
-    assert studies.published_policy(robot, agent) == study
+    for scale in ("reduced", "full", "smoke"):
+        monkeypatch.setenv("SHAPEBODY_SCALE", scale)
+        assert studies.published_policy(robot, agent) == study
