@@ -7,8 +7,8 @@ An agent is a folder:
     states.npz            the state bank (absent if the agent has none)
     curve.csv             the learning curve (absent if it was not recorded)
 
-`agent.json` holds SHA-256 hashes of weights and states, so that a file that was cut off, edited or
-left over from another agent is noticed.
+`agent.json` holds SHA-256 hashes of weights, states and the network configurations, so that a file
+that was cut off, edited or left over from another agent is noticed.
 """
 
 from __future__ import annotations
@@ -25,6 +25,7 @@ import os
 import platform
 import subprocess
 import zipfile
+import zlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -72,6 +73,8 @@ __all__ = [
 
 FORMAT = 1
 WEIGHTS, DESCRIPTION, STATES, CURVE = "weights.safetensors", "agent.json", "states.npz", "curve.csv"
+_CONFIGURATION = ("robots", "sizes", "policy_config", "critic_config")
+_BROKEN_ZIP = (zipfile.BadZipFile, zlib.error)
 _PACKAGES = ("shapebody", "jax", "flax", "optax", "mujoco", "numpy")
 
 
@@ -232,13 +235,17 @@ def save_agent(
     folder = data_dir() / "checkpoints" / agent.name if folder is None else Path(folder)
     weights = _flat_weights(agent)
     states = _flat_states(agent)
-    document = {
-        "format": FORMAT,
-        "name": agent.name,
+    configuration = {
         "robots": list(agent.robots),
         "sizes": dataclasses.asdict(agent.sizes),
         "policy_config": dataclasses.asdict(agent.policy_config),
         "critic_config": dataclasses.asdict(agent.critic_config),
+    }
+    document = {
+        "format": FORMAT,
+        "name": agent.name,
+        **configuration,
+        "configuration_hash": _text_hash(configuration),
         "hash": _hash(weights),
         "states_hash": None if states is None else _hash(states),
         "metadata": {**provenance(), **agent.metadata},
@@ -284,7 +291,7 @@ def load_agent(name_or_folder: str | Path) -> Agent:
         critic_config = CriticConfig(**document["critic_config"])
         name, robots = document["name"], tuple(document["robots"])
         weights_hash, states_hash = document["hash"], document["states_hash"]
-        metadata = document["metadata"]
+        metadata, configuration_hash = document["metadata"], document["configuration_hash"]
     except (KeyError, TypeError, ValueError) as error:
         raise ValueError(
             f"{folder / DESCRIPTION} is not a valid agent description "
@@ -318,6 +325,12 @@ def load_agent(name_or_folder: str | Path) -> Agent:
         metadata=metadata,
     )
     check_agent(agent)
+    # Other settings of the same shapes would make other networks of the same weights.
+    if _text_hash({name: document[name] for name in _CONFIGURATION}) != configuration_hash:
+        raise ValueError(
+            f"{', '.join(_CONFIGURATION)} in {folder / DESCRIPTION} do not match their hash: the "
+            f"file was edited; {restore}"
+        )
     return agent
 
 
@@ -424,7 +437,15 @@ def _read_states(path: Path, expected_hash: str, fix: str):
             arrays = {name: file[name] for name in file.files}
         owners = arrays["state_robots"]
         states = Observation(**{k: v for k, v in arrays.items() if k != "state_robots"})
-    except (OSError, KeyError, TypeError, ValueError, EOFError, zipfile.BadZipFile) as error:
+    except (
+        OSError,
+        KeyError,
+        TypeError,
+        ValueError,
+        EOFError,
+        zlib.error,
+        zipfile.BadZipFile,
+    ) as error:
         raise ValueError(f"{path} is cut off or no state bank ({error}); {fix}") from error
     if _hash(arrays) != expected_hash:
         raise ValueError(
@@ -497,6 +518,12 @@ def _hash(arrays: Mapping[str, np.ndarray]) -> str:
         digest.update(f"{name} {array.dtype.str} {array.shape}\n".encode())
         digest.update(array.tobytes())
     return digest.hexdigest()
+
+
+def _text_hash(document: dict) -> str:
+    """SHA-256 of a JSON document, independent of the order of its keys."""
+    text = json.dumps(document, sort_keys=True, default=_plain)
+    return hashlib.sha256(text.encode()).hexdigest()
 
 
 def _csv(rows: Sequence[Mapping[str, Any]]) -> str:

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import contextlib
 import csv
 import os
 import secrets
+import signal
+import threading
 from collections.abc import Mapping
 from pathlib import Path
 
@@ -26,7 +29,7 @@ def atomic_write_all(files: Mapping[Path, bytes | str]) -> None:
     """Write files that belong together; their folders are created if needed.
 
     All are written under temporary names first. Then they take their places at once, in the given
-    order: what is interrupted before leaves all the old files.
+    order. An interruption before that leaves all the old files; Ctrl-C during it waits.
     """
     temporaries = {}
     try:
@@ -38,11 +41,28 @@ def atomic_write_all(files: Mapping[Path, bytes | str]) -> None:
                 file.write(data.encode() if isinstance(data, str) else data)
                 file.flush()
                 os.fsync(file.fileno())
-        for temporary, path in temporaries.items():
-            os.replace(temporary, path)
+        with _uninterrupted():
+            for temporary, path in temporaries.items():
+                os.replace(temporary, path)
     finally:
         for temporary in temporaries:
             temporary.unlink(missing_ok=True)
+
+
+@contextlib.contextmanager
+def _uninterrupted():
+    """Ctrl-C is held back until the end of the block (Python delivers it to the main thread)."""
+    held = []
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    before = signal.signal(signal.SIGINT, lambda *_: held.append(True))
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, signal.SIG_DFL if before is None else before)
+    if held:
+        signal.raise_signal(signal.SIGINT)
 
 
 def read_curve(path: str | Path) -> dict[str, np.ndarray]:

@@ -1,4 +1,4 @@
-"""URMA networks: the policy, the original critic and the direct-design critic (eq. 4).
+"""URMA networks: the policy, the original critic and the direct-design critic (eq. 3).
 
 A robot is a set of joints and a set of feet, each with a description d and an observation o. Every
 part is encoded on its own and the parts are summed, so one network serves any number of them:
@@ -8,7 +8,7 @@ part is encoded on its own and the parts are summed, so one network serves any n
 The value is a function of o in the policy and in the original critic, and of (d, o) in the
 direct-design critic. The sum, together with the general observations, enters a core network.
 
-The key layer sees the observation as well as the description, as in the published policies; eq. (4)
+The key layer sees the observation as well as the description, as in the published policies; eq. (3)
 writes the description only. Its first layer is linear in [d, o], so `embed` computes the part that
 depends on the design once, and `act` (or `value`) adds the rest for every state of that design.
 
@@ -210,7 +210,7 @@ def elu(x):
 
 
 class PartEncoder(nn.Module):
-    """Encoder of one kind of part (joints or feet): keys, values and their sum (eq. 4)."""
+    """Encoder of one kind of part (joints or feet): keys, values and their sum (eq. 3)."""
 
     description_size: int
     observation_size: int

@@ -6,6 +6,7 @@ inferred from the rest of it (`shapebody.inference`). All arrays of `Robot` are 
 """
 
 import difflib
+import hashlib
 import os
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -73,6 +74,11 @@ class Robot:
     actuator_forces."""
     inferred: tuple[str, ...] = ()
     """What the file lacked and what is assumed instead, one sentence each."""
+
+    @property
+    def hash(self) -> str:
+        """First 16 hexadecimal digits of the SHA-256 of `xml`."""
+        return hashlib.sha256(self.xml.encode()).hexdigest()[:16]
 
     @property
     def num_bodies(self) -> int:

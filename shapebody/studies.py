@@ -70,7 +70,8 @@ def design_study(
     """Search for designs in several ways and let the frozen policy walk with all of them.
 
     Every found design, every start and the reference are evaluated on the same episodes of
-    `horizon` control steps. The result is kept in data/results, run by run (`result_in_parts`).
+    `horizon` control steps. The result is kept in data/results, run by run (`result_in_parts`), in
+    a file of its own for every robot file.
 
     Args:
         agent, robot: who is asked, and about which robot.
@@ -101,9 +102,9 @@ def design_study(
         least = 0 if name in ("seed", "first_start") else 1
         if not isinstance(value, numbers.Integral) or value < least:
             raise ValueError(f"{name} is {value!r}; expected an integer of at least {least}")
-    for run in runs:
-        _validate(run)
     short = {} if iterations is None else {"iterations": iterations}
+    for run in runs:
+        _validate(run, short)
     parts = {"starts and reference": partial(_initial_records, agent, robot, **setting)}
     for run in runs:
         parts[_part(run)] = partial(_run_records, agent, robot, run, short, **setting)
@@ -117,7 +118,7 @@ def _setting(starts, episodes, horizon, seed, first_start) -> dict:
     return setting if first_start == 0 else setting | {"first_start": first_start}
 
 
-def _validate(run: Run) -> None:
+def _validate(run: Run, settings: dict) -> None:
     if run.method not in METHODS:
         raise ValueError(f"unknown method {run.method!r} in {run}; known: {', '.join(METHODS)}")
     if run.origin not in ("start", "reference"):
@@ -127,10 +128,15 @@ def _validate(run: Run) -> None:
         raise ValueError(f"trust_region is {value!r} in {run}; expected None, it has no λ")
     if not alone and not (isinstance(value, numbers.Real) and 0 <= value < np.inf):
         raise ValueError(f"trust_region is {value!r} in {run}; expected a number of at least 0")
+    METHODS[run.method].config(**settings)  # refuses what the method cannot use
 
 
 def _file(robot, first_start: int) -> str:
-    suffix = f"_starts_from_{first_start}" if first_start else ""
+    """Name of a study's file. A robot that is not the shipped one of its name has its own."""
+    shipped = data_dir() / "robots" / f"{robot.name}.xml"
+    known = shipped.is_file() and shipped.read_text(encoding="utf-8") == robot.xml
+    suffix = "" if known else f"_{robot.hash}"
+    suffix += f"_starts_from_{first_start}" if first_start else ""
     return f"design_study_{robot.name}{suffix}"
 
 
@@ -261,7 +267,8 @@ def gains(records: list[dict], quantity: str = "return") -> list[dict]:
         alone, which leaves out the luck with the episodes that all starts share.
 
     Raises:
-        ValueError: if a design has no counterpart to be compared with.
+        ValueError: if a design has no counterpart to be compared with, or the records come from
+            two engines.
     """
     # Returns are stored by episode, other quantities as means.
     detail = "returns" if quantity == "return" else quantity
@@ -273,6 +280,12 @@ def gains(records: list[dict], quantity: str = "return") -> list[dict]:
     reference = [r for r in records if r["origin"] == "reference"]
     base = [r for r in reference if r["method"] == "none"]
     initial = found.get(("none", None), {})
+    engines = sorted({r["engine"] for r in records if "engine" in r})
+    if len(engines) > 1:
+        raise ValueError(
+            f"the records come from the engines {', '.join(engines)}, whose episodes are not the "
+            "same; compute all of them with one (recompute=True)"
+        )
     if len(base) != 1 or not initial:
         raise ValueError(
             f"the records hold {len(base)} evaluations of the reference and {len(initial)} of "

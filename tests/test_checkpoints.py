@@ -3,6 +3,7 @@
 import dataclasses
 import json
 import os
+import signal
 
 import jax
 import jax.numpy as jnp
@@ -171,6 +172,42 @@ def test_curve(agent, folder):
     (folder / "curve.csv").write_text("steps,return\n10,many\n")
     with pytest.raises(ValueError, match="no learning curve .*'many'"):
         load_curve(folder)
+
+
+def test_settings_that_were_edited_are_noticed(agent, folder):
+    """`latent_scale` changes what the networks compute, and no shape."""
+    path = folder / "agent.json"
+    document = json.loads(path.read_text())
+    document["critic_config"]["latent_scale"] *= 2
+    path.write_text(json.dumps(document))
+    with pytest.raises(ValueError, match="critic_config in .* the file was edited; restore"):
+        load_agent(folder)
+
+
+def test_a_state_bank_with_a_broken_byte_is_refused(folder):
+    path = folder / "states.npz"
+    whole = path.read_bytes()
+    for place in np.linspace(0, len(whole) - 1, 40).astype(int):
+        path.write_bytes(whole[:place] + bytes([whole[place] ^ 0xFF]) + whole[place + 1 :])
+        try:
+            load_agent(folder)  # a byte that no array depends on may change
+        except ValueError as error:
+            assert "restore the folder" in str(error)
+
+
+def test_an_interrupt_between_two_files_waits_for_the_last(agent, folder, monkeypatch):
+    other = dataclasses.replace(agent, policy=jax.tree.map(lambda x: 2 * x, agent.policy))
+    move = os.replace
+
+    def interrupted(*paths):
+        signal.raise_signal(signal.SIGINT)
+        move(*paths)
+
+    monkeypatch.setattr("os.replace", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        save_agent(other, folder)
+    monkeypatch.undo()
+    assert load_agent(folder).hash == other.hash != agent.hash
 
 
 def test_names(agent, tmp_path, monkeypatch):

@@ -1,5 +1,6 @@
 """Design studies: searches, their evaluation, and the file that keeps both."""
 
+import dataclasses
 import json
 from pathlib import Path
 
@@ -105,7 +106,7 @@ def test_what_is_stored_is_not_computed_again(results, agent, robot, monkeypatch
     assert searched == ["cem"]
     assert second["records"][:7] == first["records"]
     (path,) = results.iterdir()
-    assert path.name == f"design_study_{robot.name}.json"
+    assert path.name == f"design_study_{robot.name}_{robot.hash}.json"
     assert len(json.loads(path.read_text())["parts"]) == 4
     design_study(agent, robot, RUNS[:1], recompute=True, **SETTING)
     assert searched == ["cem", "penalty-only"]
@@ -115,12 +116,13 @@ def test_what_is_stored_is_not_computed_again(results, agent, robot, monkeypatch
 def test_other_starts_have_their_own_file(results, agent, robot):
     runs = (CONTROL, Run("vgds", 20.0))
     own = design_study(agent, robot, runs, **dict(SETTING, starts=3))["records"]
-    path = results / f"design_study_{robot.name}.json"
+    path = results / f"design_study_{robot.name}_{robot.hash}.json"
     before = path.read_bytes()
     other = design_study(agent, robot, runs, first_start=2, **dict(SETTING, starts=1))["records"]
     assert [r["start"] for r in other] == [2, None, 2, 2]
     assert path.read_bytes() == before
-    stored = json.loads((results / f"design_study_{robot.name}_starts_from_2.json").read_text())
+    (mine,) = results.glob("*_starts_from_2.json")
+    stored = json.loads(mine.read_text())
     assert all(
         part["provenance"]["config"]["first_start"] == 2 for part in stored["parts"].values()
     )
@@ -149,7 +151,29 @@ def test_a_run_that_cannot_be_stops_before_the_first(results, agent, robot, run,
         design_study(agent, robot, (CONTROL, run), **SETTING)
     with pytest.raises(ValueError, match="starts is 0; expected an integer of at least 1"):
         design_study(agent, robot, RUNS, **dict(SETTING, starts=0))
+    with pytest.raises(ValueError, match="iterations is 0; expected an integer from 1 up"):
+        design_study(agent, robot, RUNS, **dict(SETTING, iterations=0))
     assert not results.exists()
+
+
+def test_a_robot_file_that_was_changed_has_its_own_study(results, agent, robot):
+    folder = results.parent / "robots"
+    folder.mkdir()
+    (folder / f"{robot.name}.xml").write_text(robot.xml)
+    design_study(agent, robot, RUNS[:1], **SETTING)
+    shipped = results / f"design_study_{robot.name}.json"
+    before = shipped.read_bytes()
+    other = dataclasses.replace(robot, xml=robot.xml + "<!-- another -->")
+    design_study(agent, other, RUNS[:1], **SETTING)
+    assert shipped.read_bytes() == before
+    assert (results / f"design_study_{robot.name}_{other.hash}.json").exists()
+
+
+def test_gains_refuse_two_engines(results, agent, robot):
+    records = design_study(agent, robot, RUNS[:1], **SETTING)["records"]
+    records[-1]["engine"] = "mjx"
+    with pytest.raises(ValueError, match="engines mjx, native"):
+        studies.gains(records)
 
 
 def test_available_runs_are_installed_or_stored(results, agent, robot, monkeypatch):
