@@ -224,6 +224,26 @@ def baselines():
     return rows
 
 
+def with_ratios(rows):
+    """Rows with the speed of the environment over that of the C engine, as far as both are there.
+
+    A ratio's commit is that of its two rows, or both of them.
+    """
+    whole = "environment, C engine"
+    names = ("C engine alone", "C engine inside it")
+    rows = {k: v for k, v in rows.items() if k not in [f"environment / {name}" for name in names]}
+    for name in names:
+        if {name, whole} <= rows.keys():
+            commits = [rows[label].get("commit") or "unknown" for label in (whole, name)]
+            rows[f"environment / {name}"] = {
+                "value": rows[whole]["value"] / rows[name]["value"],
+                "unit": "",
+                "benchmark": "environment",
+                "commit": " and ".join(dict.fromkeys(commits)),
+            }
+    return rows
+
+
 BENCHMARKS = {
     "import": import_time,
     "engine": engine,
@@ -261,12 +281,6 @@ def main():
         for label, (value, unit) in json.loads(output.splitlines()[-1]).items():
             rows[label] = {"value": value, "unit": unit, "benchmark": name}
             print(f"{label:52s} {value:12,.2f} {unit}", flush=True)
-    for name in ("C engine alone", "C engine inside it"):
-        if {name, "environment, C engine"} <= rows.keys():
-            label = f"environment / {name}"
-            ratio = rows["environment, C engine"]["value"] / rows[name]["value"]
-            rows[label] = {"value": ratio, "unit": "", "benchmark": "environment"}
-            print(f"{label:52s} {ratio:12.2f}")
     from shapebody.experiments import provenance
 
     source = provenance(robot=ROBOT, environments=ENVIRONMENTS)
@@ -277,6 +291,10 @@ def main():
             old = json.load(file)["rows"].items()
         kept = {label: row for label, row in old if row.get("benchmark", "import") not in ran}
         rows = {**kept, **rows}
+    rows = with_ratios(rows)
+    for label, row in rows.items():
+        if label.startswith("environment / "):
+            print(f"{label:52s} {row['value']:12.2f}")
     record = {"rows": rows, "provenance": source}
     temporary = options.out + ".tmp"
     with open(temporary, "w") as file:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+import numbers
 import time
 from dataclasses import dataclass, field
 from typing import NamedTuple
@@ -43,9 +44,10 @@ class EvaluationConfig:
     def __post_init__(self):
         for name in ("episodes", "num_envs"):
             value = getattr(self, name)
-            if value != int(value) or value < 1:
+            integer = isinstance(value, numbers.Integral) and not isinstance(value, bool)
+            if not integer or value < 1:
                 raise ValueError(f"{name} is {value!r}; expected an integer of at least 1")
-        if not 0 <= self.coefficient <= 1:
+        if not isinstance(self.coefficient, numbers.Real) or not 0 <= self.coefficient <= 1:
             raise ValueError(f"coefficient is {self.coefficient!r}; expected a number in [0, 1]")
 
 
@@ -57,7 +59,8 @@ class Evaluation:
 
     Attributes:
         returns: float32, undiscounted sum of rewards until the episode ended.
-        tracking_error: float32, mean over time and both axes of |v_xy - c_xy| in m/s.
+        tracking_error: float32, mean over time and both axes of |v_xy - c_xy| in m/s, where each
+            term counts as at most twice the command limit.
         lengths: int32, control steps.
         finite: bool, False where the simulation became invalid, which ended the episode.
         seconds: wall time of the rollouts.
@@ -422,7 +425,7 @@ def paired_gain(
         ValueError: if the shapes differ, or the two evaluations had other seeds or settings.
     """
     if isinstance(after, Evaluation) and isinstance(before, Evaluation):
-        for name in ("robot", "engine", "seed", "coefficient", "task"):
+        for name in ("robot", "engine", "seed", "coefficient", "task", "recompute_constants"):
             if after.settings[name] != before.settings[name]:
                 raise ValueError(
                     f"the evaluations differ in {name}: {after.settings[name]!r} and "

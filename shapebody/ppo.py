@@ -14,7 +14,6 @@ over the full design space.
 """
 
 import csv
-import hashlib
 import io
 import json
 import math
@@ -31,7 +30,14 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 
-from shapebody.checkpoints import Agent, atomic_write, load_arrays, save_agent, save_arrays
+from shapebody.checkpoints import (
+    Agent,
+    atomic_write,
+    load_agent,
+    load_arrays,
+    save_agent,
+    save_arrays,
+)
 from shapebody.files import read_safetensors
 from shapebody.locomotion import Locomotion, TaskConfig, Trajectory
 from shapebody.locomotion.observations import COMMAND, Observation
@@ -88,7 +94,7 @@ class TrainConfig:
     entropy_coefficient: float = 0.005
     max_gradient_norm: float = 3.0
     kl_threshold: float = 0.5
-    """The rest of an iteration's updates is skipped once a minibatch exceeds this."""
+    """The rest of an iteration's updates is skipped once a minibatch exceeds this; inf: never."""
 
     task: TaskConfig = field(default_factory=TaskConfig)
     learn_policy: bool = True
@@ -101,6 +107,12 @@ class TrainConfig:
         object.__setattr__(self, "robots", robots)
         if not robots:
             raise ValueError("robots is (); expected at least one name or path")
+        names = [_robot_name(robot) for robot in robots]
+        if len(set(names)) < len(names):
+            raise ValueError(
+                f"robots is {robots!r}; expected robots of different names: a robot is known by "
+                "the name of its file, so leave out repeated ones, or copy a file to another name"
+            )
         if not self.name or Path(self.name).name != self.name:
             raise ValueError(
                 f"name is {self.name!r}; expected the name of a folder, without separators"
@@ -114,6 +126,18 @@ class TrainConfig:
             value = getattr(self, name)
             if not _is_number(value, 1) and (name, value) != ("value_lambda", None):
                 raise ValueError(f"{name} is {value!r}; expected a number from 0 to 1")
+        if type(self.seed) is not int or self.seed < 0:
+            raise ValueError(f"seed is {self.seed!r}; expected an integer of at least 0")
+        if not _is_number(self.entropy_coefficient, math.inf):
+            raise ValueError(
+                f"entropy_coefficient is {self.entropy_coefficient!r}; expected a number of at "
+                "least 0"
+            )
+        for name in ("clip_range", "max_gradient_norm", "kl_threshold"):
+            value = getattr(self, name)
+            endless = name == "kl_threshold" and value == math.inf
+            if not endless and not (_is_number(value, math.inf) and value > 0):
+                raise ValueError(f"{name} is {value!r}; expected a positive number")
         rates = self.learning_rate
         rates = tuple(rates) if isinstance(rates, tuple | list) else ()
         if len(rates) != 2 or not all(_is_number(rate, math.inf) for rate in rates):
@@ -201,12 +225,18 @@ class TrainConfig:
 
 def _default_name(robot: str, changes: dict) -> str:
     """Name of an agent: its robots' names, or those of their files, joined with "+"."""
-    return "+".join(Path(str(name)).stem for name in changes.get("robots", (robot,)))
+    return "+".join(_robot_name(name) for name in changes.get("robots", (robot,)))
+
+
+def _robot_name(name_or_path) -> str:
+    """The name of a robot that is given by name or file, without reading the file."""
+    return Path(str(name_or_path)).stem
 
 
 def _is_number(value, high: float) -> bool:
     """Whether a value is a finite number from 0 to `high`."""
-    return isinstance(value, int | float) and 0 <= value <= high and value < math.inf
+    number = isinstance(value, int | float) and not isinstance(value, bool)
+    return number and 0 <= value <= high and value < math.inf
 
 
 @jax.tree_util.register_dataclass
@@ -571,7 +601,7 @@ class Trainer:
         native = self.env.engine == "native"
         self.saved_physics = self.env.physics_arrays() if native else self.env.physics_state
         if not resumed:
-            robots = {robot.name: _robot_hash(robot) for robot in self.env.robots}
+            robots = {robot.name: robot.hash for robot in self.env.robots}
             first = {"from_step": 0, "config": _plain(self.config)}
             self.phases = [first | {"robots": robots, "engine": self.env.engine}]
             return False
@@ -613,10 +643,8 @@ class Trainer:
         """
         folder = Path(folder) if folder else self.folder
         agent = self.agent(self.state_bank())
-        save_agent(agent, folder)
         curve = self.folder / "training.csv"
-        if curve.exists():
-            atomic_write(folder / "curve.csv", curve.read_text())
+        save_agent(agent, folder, _rows(curve) if curve.exists() else None)
         return agent
 
     # -------------------------------------------------------------- the loop
@@ -624,6 +652,11 @@ class Trainer:
     def _collect(self, behaviour, state, number):
         key = jax.random.fold_in(self.key, 2 * number)
         return self.env.rollout(self.act, behaviour, state, key, self.config.rollout_length)
+
+    def last_iteration(self, max_steps=None) -> int:
+        """Number of finished iterations at which `run` ends with that budget."""
+        last = self.config.iterations
+        return last if max_steps is None else min(last, max_steps // self.config.batch)
 
     def run(self, max_steps=None, max_seconds=None, progress=True, curve_interval=None) -> None:
         """Train until the configured number of steps, or until a budget is used up.
@@ -635,10 +668,7 @@ class Trainer:
             curve_interval: iterations per row of the learning curve, CURVE_INTERVAL if not given.
         """
         config = self.config
-        last = config.iterations
-        if max_steps is not None:
-            last = min(last, max_steps // config.batch)
-        number = int(self.learner.iteration)
+        number, last = int(self.learner.iteration), self.last_iteration(max_steps)
         if number >= last:
             return
         self.folder.mkdir(parents=True, exist_ok=True)
@@ -690,6 +720,9 @@ class Trainer:
     def state_bank(self, rollouts: int = 8):
         """States from rollouts of the policy on random designs at c = 1 (Section 3.2).
 
+        Designs and episodes are those of the task: the policy-evaluation phase, from which the
+        shipped banks come, has f ~ U([-r, r]^d) with r ~ U(0, 1) and short episodes.
+
         Returns (Observation [M, ...] of numpy arrays, robot index int32[M]).
         """
         count = self.config.state_bank
@@ -732,7 +765,9 @@ def train(
     """Train an agent, or continue its training, and save it.
 
     An interrupt (Ctrl-C) ends the call early, with the agent of the last iteration; before the
-    first one there is nothing to save, and KeyboardInterrupt is raised.
+    first one there is nothing to save, and KeyboardInterrupt is raised. A call that trains nothing,
+    because the run is at its end or at `max_steps`, leaves an agent of at least as many steps in
+    the folder as it is, with the critic that `train_critic` may have given it.
 
     Args:
         config: the run, for example `TrainConfig.reduced("unitree_go2")`.
@@ -743,14 +778,16 @@ def train(
         max_seconds: stop after this many seconds. After either, the run can be continued.
         engine: "native", "mjx" or "auto", see `Trainer`.
         state_only: leave the agent in the folder as it is; the run can be annealed later.
-        replace: replace the agent in the folder even if it has more steps than the run.
+        replace: replace the agent in the folder even if it has more steps than the run, or if
+            nothing was trained.
 
     Returns:
-        The agent, with its state bank; None with `state_only`.
+        The agent in the folder, with its state bank; None with `state_only`.
 
     Raises:
         ValueError: if `max_steps` is less than one iteration, if the agent in the folder has more
-            steps than the run, or if the run there cannot be continued with `config`.
+            steps than the run that is to go on, or if the run there cannot be continued with
+            `config`.
     """
     if max_steps is not None and max_steps < config.batch:
         raise ValueError(
@@ -759,28 +796,38 @@ def train(
         )
     trainer = Trainer(config, folder, engine)
     trainer.start()
-    if not (state_only or replace):
+    begun = trainer.steps
+    if not (state_only or replace) and begun < trainer.last_iteration(max_steps) * config.batch:
         others = ", state_only=True (--state-only) to leave it, or choose another name or folder"
-        _keep_agent(trainer.folder, trainer.steps, others)
+        _keep_agent(trainer.folder, begun, others)
     _run(trainer, progress, max_steps, max_seconds)
-    return None if state_only else trainer.save_agent()
+    if state_only:
+        return None
+    if not replace and trainer.steps == begun <= (_agent_steps(trainer.folder) or 0):
+        return load_agent(trainer.folder)
+    return trainer.save_agent()
 
 
 STATE_FILES = ("training.safetensors", "training.json", "training.csv")
 """A run in its folder: its state, its configurations and its learning curve."""
 
 
-def _keep_agent(folder: Path, steps: int, others: str = "") -> None:
-    """Raise ValueError if the agent in a folder has more steps than the one to replace it."""
+def _agent_steps(folder: Path) -> int | None:
+    """Steps of the agent in a folder: None if there is no agent, 0 if it does not say."""
     path = folder / "agent.json"
     if not path.exists():
-        return
+        return None
     try:
-        kept = int(json.loads(path.read_text())["metadata"]["steps"])
+        return int(json.loads(path.read_text())["metadata"]["steps"])
     except (ValueError, LookupError, TypeError):
-        kept = 0
+        return 0
+
+
+def _keep_agent(folder: Path, steps: int, others: str = "") -> None:
+    """Raise ValueError if the agent in a folder has more steps than the one to replace it."""
+    kept = _agent_steps(folder)
     # A run that is about to begin replaces no agent, not even one of unknown steps.
-    if kept > steps or steps == 0:
+    if kept is not None and (kept > steps or steps == 0):
         raise ValueError(
             f"the agent in {folder} has {kept:,} steps, the run that would replace it {steps:,}; "
             f"pass replace=True (--replace) to replace it{others}"
@@ -897,7 +944,8 @@ def train_critic(
     The agent's policy acts (with its exploration noise) on designs f ~ U([-r, r]^d) with
     r ~ U(0, 1); the critic learns its TD(lambda) returns. An episode lasts 200 control steps at
     most, since what a critic has to learn here is the design: it sees more of them than with whole
-    episodes, and the value of what follows is bootstrapped.
+    episodes, and the value of what follows is bootstrapped. The new state bank comes from such
+    designs and episodes too, at all distances from f = 0 instead of over the full design space.
 
     Args:
         agent: its policy is kept, its critic and state bank are replaced.
@@ -971,8 +1019,8 @@ def _run(trainer: Trainer, progress, max_steps, max_seconds) -> None:
 
 
 def _plain(config: TrainConfig) -> dict:
-    """A configuration as it reads back from JSON: tuples are lists."""
-    return json.loads(json.dumps(asdict(config)))
+    """A configuration as it reads back from JSON: tuples are lists, inf is the text "Infinity"."""
+    return json.loads(json.dumps(asdict(config)), parse_constant=str)
 
 
 def _from_plain(kind, values: dict):
@@ -981,6 +1029,8 @@ def _from_plain(kind, values: dict):
     def value(hint, given):
         if is_dataclass(hint):
             return _from_plain(hint, given)
+        if hint is float and given == "Infinity":
+            return math.inf
         return tuple(value(None, x) for x in given) if isinstance(given, list) else given
 
     hints = get_type_hints(kind)
@@ -992,6 +1042,7 @@ CHANGEABLE = (
     "epochs",
     "minibatch_size",
     "learning_rate",
+    "entropy_coefficient",
     "value_lambda",
     "cut_at_commands",
     "state_bank",
@@ -1046,10 +1097,6 @@ def _engine(folder: Path, engine: str) -> str:
     return own
 
 
-def _robot_hash(robot) -> str:
-    return hashlib.sha256(robot.xml.encode()).hexdigest()[:16]
-
-
 def _continued(path: Path, config: TrainConfig, steps: int, robots=()) -> list[dict]:
     """The phases of a run that goes on with `config`: a list of {"from_step", "config"}, the first
     with hashes of the robots' files and the name of the engine.
@@ -1085,7 +1132,7 @@ def _continued(path: Path, config: TrainConfig, steps: int, robots=()) -> list[d
             "or delete its training.safetensors to begin anew"
         )
     known = phases[0].get("robots", {})
-    changed = [r.name for r in robots if known.get(r.name, _robot_hash(r)) != _robot_hash(r)]
+    changed = [r.name for r in robots if known.get(r.name, r.hash) != r.hash]
     if changed:
         raise ValueError(
             f"the file of robot {', '.join(changed)} has changed since the run in "
@@ -1101,15 +1148,25 @@ def _difference(name: str, old, new) -> str:
     return f"{name} was {old!r}, is {new!r}"
 
 
+def _rows(path: Path) -> list[dict[str, str]]:
+    """The rows of a learning curve as text, without those that a killed run left unfinished."""
+    # The end of a line is written last; without it, even the last number may be cut off.
+    lines = [line for line in path.read_text().splitlines(keepends=True) if line.endswith("\n")]
+
+    def whole(row):
+        # A missing cell is None, and cells that are too many are under the name None.
+        return None not in row and None not in row.values() and row["steps"].isdigit()
+
+    return [row for row in csv.DictReader(lines) if whole(row)]
+
+
 class _Curve:
     """Averages over iterations, appended to a CSV file. Rows after the resumed step go."""
 
     def __init__(self, path: Path, steps: int):
         self.path = path
-        rows = []
-        if path.exists():
-            with path.open() as file:
-                rows = [row for row in csv.DictReader(file) if int(row["steps"]) <= steps]
+        rows = _rows(path) if path.exists() else []
+        rows = [row for row in rows if int(row["steps"]) <= steps]
         text = io.StringIO(newline="")
         writer = csv.DictWriter(text, CURVE)
         writer.writeheader()

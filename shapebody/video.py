@@ -277,12 +277,14 @@ def _check_qpos(model, qpos, ndim):
 
 
 def standing_pose(model: mujoco.MjModel) -> np.ndarray:
-    """float64[nq], the home keyframe (else qpos0), moved up or down until the robot touches z = 0.
+    """float64[nq], the keyframe "home", moved up or down until the robot touches z = 0.
 
-    A design has other link lengths than the reference, so its own height differs.
+    Without one of that name it is the first keyframe, and without any keyframe qpos0. A design has
+    other link lengths than the reference, so its own height differs.
     """
     model = _model_of(model)
-    qpos = (model.key_qpos[0] if model.nkey else model.qpos0).copy()
+    home = max(mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_KEY, "home"), 0)
+    qpos = (model.key_qpos[home] if model.nkey else model.qpos0).copy()
     if not (model.njnt and model.jnt_type[0] == mujoco.mjtJoint.mjJNT_FREE):
         return qpos
     data = mujoco.MjData(model)

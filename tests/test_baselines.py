@@ -22,6 +22,7 @@ from shapebody.search.loop import start_key
 from shapebody.search.particles import GCPFOConfig, _move
 from shapebody.search.populations import CEMConfig, DEConfig, PSOConfig, cem, de, pso
 from shapebody.search.sampling import RandomConfig, TuRBOConfig, random, turbo
+from shapebody.search.vgds import VGDSConfig
 
 SMALL = {
     "vgds": dict(iterations=3),
@@ -236,6 +237,8 @@ def test_evaluations_are_counted(name):
 
 
 def test_settings_of_the_paper():
+    for name in ("vgds", "penalty-only"):
+        assert METHODS[name].config() == VGDSConfig(50, 0.05, 0.1)
     assert METHODS["random"].config() == RandomConfig(50, 64)
     assert METHODS["turbo"].config() == TuRBOConfig(50, 64, 0.1, 0.005, 0.5, 0.7, 1.3)
     assert METHODS["pso"].config() == PSOConfig(50, 32, 0.9, 0.5, 0.3)
@@ -254,7 +257,12 @@ def test_settings_of_the_paper():
 @pytest.mark.parametrize(
     "name, bad",
     [
-        *((name, dict(iterations=value)) for name in METHODS for value in (0, 2.5, "ten")),
+        *(
+            (name, dict(iterations=value))
+            for name in METHODS
+            for value in (0, 2.5, 2.0, "ten", True)
+        ),
+        ("turbo", dict(iterations=float("nan"))),
         ("random", dict(candidates=0)),
         ("turbo", dict(radius=0.6)),
         ("turbo", dict(minimum_radius=0.6)),

@@ -1,5 +1,7 @@
 """Evaluation of designs: paired episodes, frozen returns, statistics."""
 
+import dataclasses
+
 import jax
 import numpy as np
 import pytest
@@ -162,8 +164,14 @@ def test_errors(agent, robot, space):
     for arguments, message in cases:
         with pytest.raises(ValueError, match=message):
             evaluate(agent, robot, **arguments)
-    with pytest.raises(ValueError, match="coefficient is 2"):
-        EvaluationConfig(coefficient=2)
+    for name in ("episodes", "num_envs"):
+        for value in (2.0, "a", float("nan"), True, -1):
+            with pytest.raises(ValueError, match=f"{name} is {value!r}; expected an integer"):
+                EvaluationConfig(**{name: value})
+    assert EvaluationConfig(episodes=np.int64(3)).episodes == 3
+    for value in (2, "a", float("nan")):
+        with pytest.raises(ValueError, match=f"coefficient is {value!r}; expected"):
+            EvaluationConfig(coefficient=value)
 
 
 # statistics
@@ -221,6 +229,9 @@ def test_gain_of_evaluations(agent, robot, space):
     other = native(agent, robot, f, seed=1)
     with pytest.raises(ValueError, match="differ in seed: 1 and 0"):
         paired_gain(other, one)
+    other = dataclasses.replace(one, settings={**one.settings, "recompute_constants": True})
+    with pytest.raises(ValueError, match="differ in recompute_constants: False and True"):
+        paired_gain(two, other)
 
 
 def test_statistics_refuse_bad_input():

@@ -1,6 +1,8 @@
 """The locomotion task: rewards, curriculum, commands, padding, failure, resume, two engines."""
 
-from dataclasses import replace
+import importlib.util
+from dataclasses import fields, replace
+from pathlib import Path
 
 import jax
 import jax.numpy as jnp
@@ -253,6 +255,7 @@ def test_padding_and_company_change_nothing(go2):
     start = go2.design_dim
     designs = np.zeros((4, golem.design_dim), np.float32)
     designs[:, :start] = np.random.default_rng(0).uniform(-0.5, 0.5, (4, start))
+    designs[:2, start:] = np.nan  # padding
     a = alone.reset(None, designs=designs[:2, :start], keys=keys[:2])
     b = mixed.reset(None, designs=designs, keys=keys)
     assert mixed.sizes == Sizes.of(go2, golem)
@@ -264,10 +267,78 @@ def test_padding_and_company_change_nothing(go2):
             padded.observation.joints[:, :2, :12], short.observation.joints, rtol=1e-3, atol=1e-5
         )
     assert np.all(np.asarray(padded.observation.joints)[:, :2, 12:] == 0)
+    with pytest.raises(ValueError, match=r"shape \(4, 358\); expected one design \[688\]"):
+        mixed.reset(None, designs=designs[:, :start], keys=keys)
+    with pytest.raises(ValueError, match="designs of robot 'golem': design entry .* is nan"):
+        mixed.reset(None, designs=designs[0], keys=keys)
     with pytest.raises(ValueError, match="2 robots need"):
         Locomotion([go2, golem], 1)
     with pytest.raises(ValueError, match="engine is 'bullet'"):
         Locomotion(go2, 1, engine="bullet")
+
+
+def test_designs_are_checked(env):
+    key, zeros = jax.random.PRNGKey(0), np.zeros(358)
+    state = env.reset(key, designs=zeros[None])
+    keys = jax.random.split(key, 2)
+    before = env.physics_arrays()
+    for designs, message in [
+        (zeros[1:], r"shape \(357,\); expected one design \[358\] or"),
+        (np.zeros((3, 358)), r"shape \(3, 358\); expected"),
+        (np.zeros(()), r"shape \(\)"),
+        (zeros + 1.1, r"is 1.1.*, expected \[-1, 1\]"),
+        (zeros * np.nan, "is nan, expected a finite number"),
+    ]:
+        with pytest.raises(ValueError, match=message):
+            env.reset(key, designs=designs)
+        with pytest.raises(ValueError, match=message):
+            env.restart(state, [1, 4], keys, designs)
+    for wrong in (zeros, np.zeros((0, 358)), np.zeros((2, 357)), np.full((1, 358), 2.0)):
+        with pytest.raises(ValueError, match="expected"):
+            env.descriptions(0, wrong)
+    for old, new in zip(
+        jax.tree.leaves(before), jax.tree.leaves(env.physics_arrays()), strict=True
+    ):
+        np.testing.assert_array_equal(old, new)
+
+
+def test_without_auto_reset_an_environment_goes_on(go2):
+    """As the documentation of `auto_reset` says: whoever steps it has to note the end."""
+    config = TaskConfig(**QUIET, horizon=1)
+    env = Locomotion(go2, 2, config=config, threads=1, engine="native", auto_reset=False)
+    state = env.reset(jax.random.PRNGKey(0), designs=np.zeros(358), coefficient=0.0)
+    _, trajectory = env.rollout(wave, None, state, jax.random.PRNGKey(0), 3)
+    assert np.all(np.asarray(trajectory.truncated) | np.asarray(trajectory.terminated))
+    assert np.all(np.diff(trajectory.episode_return, axis=0) > 0)
+    np.testing.assert_array_equal(trajectory.episode_length[:, 0], [1, 2, 3])
+
+
+NUMBERS = [
+    field.name
+    for field in fields(TaskConfig)
+    if isinstance(getattr(TaskConfig(), field.name), int | float) and field.type is not bool
+] + ["command_limit", "action_delay"]
+
+
+@pytest.mark.parametrize("name", NUMBERS)
+def test_settings_without_sense_are_named(name):
+    for wrong in (-1, float("nan"), float("inf"), "much", True):
+        with pytest.raises(ValueError, match=f"^{name} is .*; expected"):
+            TaskConfig(**{name: wrong})
+
+
+def test_ranges_of_settings():
+    shares = ("command_change", "command_all_zero", "command_single_zero", "mixed_delay")
+    for name in (*shares, "push_probability", "push_add"):
+        assert getattr(TaskConfig(**{name: 1}), name) == 1
+        with pytest.raises(ValueError, match=f"{name} is 1.1; expected a probability"):
+            TaskConfig(**{name: 1.1})
+    for name in ("horizon", "curriculum_levels", "curriculum_length"):
+        for wrong in (0, 2.0):
+            with pytest.raises(ValueError, match=f"{name} is {wrong}; expected an integer"):
+                TaskConfig(**{name: wrong})
+    with pytest.raises(ValueError, match="command_limit is 0"):
+        TaskConfig(command_limit=0)
 
 
 def test_a_broken_simulation_ends_alone(go2):
@@ -382,3 +453,24 @@ def test_designs_at_every_distance(go2):
     for wrong in [(0.5, 0.2), (-0.1, 1.0), (0.0, 2.0), (0.0, np.nan), 0.5, (0.5,), None]:
         with pytest.raises(ValueError, match="design_radius"):
             TaskConfig(design_radius=wrong)
+
+
+def test_ratios_of_benchmarks_follow_their_rows():
+    path = Path(__file__).parents[1] / "benchmarks" / "run.py"
+    spec = importlib.util.spec_from_file_location("benchmarks_run", path)
+    benchmarks = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(benchmarks)
+    rows = {
+        "environment, C engine": {"value": 3.0, "commit": "new"},
+        "C engine alone": {"value": 4.0, "commit": "old"},
+        "C engine inside it": {"value": 6.0, "commit": "new"},
+        "environment / C engine alone": {"value": 0.9, "commit": "old"},
+    }
+    merged = benchmarks.with_ratios(rows)
+    ratios = [merged[f"environment / C engine {where}"] for where in ("alone", "inside it")]
+    assert [(row["value"], row["commit"]) for row in ratios] == [
+        (0.75, "new and old"),
+        (0.5, "new"),
+    ]
+    del rows["environment, C engine"]
+    assert "environment / C engine alone" not in benchmarks.with_ratios(rows)

@@ -1,5 +1,6 @@
 """PPO: advantages, one update, exact resume, policy evaluation."""
 
+import json
 import time
 from dataclasses import replace
 from types import SimpleNamespace
@@ -70,6 +71,10 @@ def test_configurations():
     "name, value",
     [
         ("robots", ()),
+        ("robots", ("a/legs.xml", "b/legs.xml")),
+        ("robots", ("unitree_go2", "unitree_go2")),
+        ("seed", -1),
+        ("seed", 1.0),
         ("num_envs", -256),
         ("rollout_length", 0),
         ("total_steps", 0),
@@ -78,10 +83,18 @@ def test_configurations():
         ("epochs", 0),
         ("state_bank", 0),
         ("discount", 2.0),
+        ("discount", True),
         ("gae_lambda", 7),
         ("gae_lambda", None),
         ("value_lambda", 1.5),
         ("value_lambda", float("nan")),
+        ("clip_range", 0.0),
+        ("clip_range", float("inf")),
+        ("entropy_coefficient", -0.1),
+        ("entropy_coefficient", "none"),
+        ("max_gradient_norm", 0),
+        ("kl_threshold", 0.0),
+        ("kl_threshold", float("nan")),
         ("learning_rate", 4e-4),
         ("learning_rate", (4e-4,)),
         ("learning_rate", (4e-4, -1e-4)),
@@ -201,6 +214,29 @@ def test_an_agent_is_not_replaced_by_one_with_fewer_steps(config, tmp_path):
     assert load_agent(tmp_path).hash == agent.hash
 
 
+def test_a_call_that_trains_nothing_leaves_the_agent(config, tmp_path, monkeypatch):
+    config = replace(config, num_envs=8, minibatch_size=32, epochs=1)
+    arguments = dict(folder=tmp_path, progress=False, max_steps=64)
+    trainer = ppo.Trainer(config, tmp_path)
+    monkeypatch.setattr(ppo, "Trainer", lambda *_: trainer)  # compiled once
+    agent = ppo.train(config, **arguments)
+    # Another critic, as train_critic saves it; then an agent of more steps, as anneal does.
+    critic = jax.tree.map(lambda x: x + 1, agent.critic)
+    for steps in (64, 128):
+        metadata = {**agent.metadata, "steps": steps, "policy_evaluation": {}}
+        save_agent(replace(agent, critic=critic, metadata=metadata), tmp_path)
+        files = {file: file.read_bytes() for file in tmp_path.iterdir()}
+        again = ppo.train(config, **arguments)
+        assert again.hash == load_agent(tmp_path).hash != agent.hash
+        assert again.metadata["steps"] == steps and "policy_evaluation" in again.metadata
+        assert {file: file.read_bytes() for file in tmp_path.iterdir()} == files
+    assert ppo.train(config, replace=True, **arguments).hash == load_agent(tmp_path).hash
+    assert "policy_evaluation" not in load_agent(tmp_path).metadata
+    # An agent that is behind the run is brought up to it.
+    ppo.train(config, state_only=True, **arguments | {"max_steps": 128})
+    assert ppo.train(config, **arguments | {"max_steps": 128}).metadata["steps"] == 128
+
+
 def test_a_run_keeps_its_engine(config, straight, tmp_path, monkeypatch):
     assert straight[1].phases[0]["engine"] == "native"
     monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
@@ -306,6 +342,9 @@ def test_state_only_saves_no_agent(config, tmp_path):
 def test_configurations_read_back_from_json():
     for config in (ppo.TrainConfig.full("unitree_go2"), ppo.TrainConfig.smoke("golem", seed=3)):
         assert ppo._from_plain(ppo.TrainConfig, ppo._plain(config)) == config
+    endless = replace(config, kl_threshold=float("inf"))
+    text = json.dumps(ppo._plain(endless), allow_nan=False)  # as in the metadata of an agent
+    assert ppo._from_plain(ppo.TrainConfig, json.loads(text)) == endless
 
 
 def test_names_of_agents():
@@ -428,11 +467,28 @@ def test_curve_has_a_row_per_interval(config, tmp_path, monkeypatch):
     assert [int(row.split(",")[0]) for row in rows[1:]] == [256, 512, 640]
 
 
+def test_a_row_that_was_cut_off_leaves_the_curve(tmp_path):
+    path = tmp_path / "training.csv"
+    cells = ["128", "1.5", "", *["0.25"] * (len(ppo.CURVE) - 3)]  # no episode has ended
+    header, first, last = (",".join(row) + "\n" for row in (ppo.CURVE, cells, ["256", *cells[1:]]))
+    # Within the steps, after some cells, within the last number, and with the next row behind it.
+    for torn in ("2", "256,1.5,", last[:-2], last[:-1], "", last[:9] + last):
+        path.write_text(header + first + torn)
+        ppo._Curve(path, steps=256)
+        assert path.read_text() == header + first, torn
+    path.write_text(header + first + last)
+    ppo._Curve(path, steps=256)
+    assert path.read_text() == header + first + last
+    ppo._Curve(path, steps=128)
+    assert path.read_text() == header + first
+
+
 def test_train_and_policy_evaluation(config, tmp_path):
     agent = ppo.train(config, tmp_path / "a", progress=False, max_steps=128)
     loaded = load_agent(tmp_path / "a")
     curve = (tmp_path / "a" / "curve.csv").read_text()
     assert curve.splitlines()[-1].startswith("128,")
+    assert curve == (tmp_path / "a" / "training.csv").read_text()
     # Training on does not touch the agent or its curve until the agent is saved.
     trainer = ppo.Trainer(config, tmp_path / "a")
     trainer.start()

@@ -12,7 +12,7 @@ from tiny import quick_compilation, tiny_agent, tiny_robot
 
 from shapebody.descriptions import describe
 from shapebody.design import DesignSpace
-from shapebody.search import METHODS, Objective, VGDSConfig, search
+from shapebody.search import Objective, VGDSConfig, search
 from shapebody.search import objective as objectives
 from shapebody.search.vgds import penalty_only, vgds
 
@@ -256,6 +256,20 @@ def test_search_improves_and_reports(agent, robot, starts):
     assert np.all(found.objective > before)
     assert found.settings["trust_region"] == 0.1 and found.settings["iterations"] == 50
     assert found.settings["agent_hash"] == agent.hash and found.settings["seed"] == 3
+    assert found.settings["reference"] is None
+    assert found.settings["states_hash"] == agent.states_hash
+
+
+def test_settings_tell_references_and_states_apart(agent, robot, space, starts):
+    def settings(**changes):
+        return search("vgds", agent, robot, starts, **BATCH, **changes).settings
+
+    half, again, third = (settings(reference=f * space.start(1)) for f in (0.5, 0.5, 0.3))
+    assert half["reference"] == again["reference"] != third["reference"]
+    assert len(half["reference"]) == 16 and half["states_hash"] == agent.states_hash
+    other = settings(states=jax.tree.map(lambda x: x[::-1], agent.states))
+    assert other["reference"] is None and other["states_hash"] != agent.states_hash
+    assert settings(states=agent.states)["states_hash"] == agent.states_hash
 
 
 def test_batch_equals_single(agent, robot, starts):
@@ -319,10 +333,3 @@ def test_errors(agent, robot, space, tmp_path):
             arguments["f"] = DesignSpace(arguments["robot"]).reference
         with pytest.raises(ValueError, match=message):
             search(**arguments)
-
-
-def test_methods_share_one_contract():
-    for name, method in METHODS.items():
-        config = method.config()
-        assert dataclasses.is_dataclass(config) and config == method.config(), name
-    assert METHODS["vgds"].config() == VGDSConfig(50, 0.05, 0.1)

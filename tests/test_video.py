@@ -104,6 +104,16 @@ def test_standing_pose_touches_the_floor(model):
     assert video.standing_pose(model)[2] == pytest.approx(0.34)
 
 
+def test_standing_pose_is_the_home_keyframe():
+    def knee(keys):
+        keys = "".join(f"<key {name} qpos='0 0 1 1 0 0 0 {angle}'/>" for name, angle in keys)
+        text = WALKER.replace("</mujoco>", f"<keyframe>{keys}</keyframe></mujoco>")
+        return video.standing_pose(mujoco.MjModel.from_xml_string(text))[7]
+
+    assert knee([("name='crouch'", 0.9), ("name='home'", 0.2)]) == 0.2
+    assert knee([("name='crouch'", 0.9), ("", 0.2)]) == 0.9
+
+
 def clip(frames=8, height=32, width=48):
     rng = np.random.default_rng(0)
     return rng.integers(0, 255, (frames, height, width, 3), dtype=np.uint8)

@@ -6,13 +6,33 @@ environment.
 """
 
 from dataclasses import dataclass
-from math import nan, pi
+from math import inf, nan, pi
+from numbers import Integral, Real
 
 CONTROL_STEP = 0.02
 """Seconds per control step (50 Hz); physics runs four substeps of 5 ms inside it."""
 
 GAIT_PERIOD = 0.5
 """Seconds per cycle of the gait clock that the policy observes."""
+
+_RANGES = {
+    "an integer of at least 1": (Integral, 1, inf, "horizon curriculum_levels curriculum_length"),
+    "a probability, from 0 to 1": (
+        Real,
+        0,
+        1,
+        "command_change command_all_zero command_single_zero mixed_delay push_probability push_add",
+    ),
+    "a finite number of at least 0": (
+        Real,
+        0,
+        inf,
+        "command_dead_zone noise_joint_position noise_joint_velocity noise_angular_velocity "
+        "noise_gravity initial_yaw initial_tilt initial_joint_factor initial_joint_offset "
+        "push_per_mass push_limit termination_height curriculum_error",
+    ),
+}
+"""What settings must be: in words, then their kind, their bounds and their names."""
 
 
 @dataclass(frozen=True)
@@ -88,7 +108,7 @@ class TaskConfig:
     cut before them without one leaves c as it is."""
 
     def __post_init__(self):
-        if self.action_delay not in (None, 0, 1):
+        if self.action_delay not in (None, 0, 1) or isinstance(self.action_delay, bool):
             raise ValueError(
                 f"action_delay is {self.action_delay!r}; expected 0, 1 or None (random per episode)"
             )
@@ -102,8 +122,17 @@ class TaskConfig:
                 "0 <= low <= high <= 1"
             )
         object.__setattr__(self, "design_radius", (low, high))
-        if self.horizon < 1:
-            raise ValueError(f"horizon is {self.horizon}; expected at least one control step")
+        limit = self.command_limit
+        if limit is not None and not (_is_number(limit, Real, 0, inf) and limit > 0):
+            raise ValueError(
+                f"command_limit is {limit!r}; expected a positive number, in m/s, or None (it "
+                "follows from the robot's dimensions)"
+            )
+        for expected, (kind, low, high, names) in _RANGES.items():
+            for name in names.split():
+                value = getattr(self, name)
+                if not _is_number(value, kind, low, high):
+                    raise ValueError(f"{name} is {value!r}; expected {expected}")
 
     @classmethod
     def evaluation(cls, **changes) -> "TaskConfig":
@@ -111,3 +140,9 @@ class TaskConfig:
         exactly one control step. The paper does not state them all; these were chosen because
         the authors' published policies then come close to the paper's printed returns."""
         return cls(**{"command_limit": 1.0, "action_delay": 1, **changes})
+
+
+def _is_number(value, kind, low, high) -> bool:
+    """Whether a value is a finite number of that kind from `low` to `high`; True is none."""
+    number = isinstance(value, kind) and not isinstance(value, bool)
+    return number and low <= value <= high and value < inf

@@ -152,7 +152,9 @@ class Locomotion:
         config: the task's settings.
         sizes: padding; by default the largest of `robots`.
         auto_reset: start a new episode, with a new random design, when one ends.
-            Without it a finished environment idles.
+            Without it a finished environment goes on: its body moves, rewards still come, and
+            `episode_return` grows. Callers must take note of an environment's first step with
+            `terminated` or `truncated`, ignore what follows, and `reset` or `restart` it.
         threads: physics threads of the native engine, 0 for all cores.
         physics_options: passed on to the engine's constructor.
 
@@ -244,6 +246,9 @@ class Locomotion:
             spread: cut the first episodes at random horizons, so that episodes do not all
                 end in the same step.
             keys: one key per environment instead of `key`, to pair episodes across designs.
+
+        Raises:
+            ValueError: for designs of another shape, outside [-1, 1] or not finite.
         """
         n = self.num_envs
         if keys is None:
@@ -255,8 +260,7 @@ class Locomotion:
                 _draw_designs(keys, coefficients, self.design_dim, self.config.design_radius)
             )
         else:
-            designs = np.asarray(designs, np.float32)
-            designs = np.broadcast_to(designs, (n, designs.shape[-1]))
+            designs = self._validated(designs, n)
         states, physics_states = [], []
         for group in self.groups:
             s = group.slice
@@ -279,8 +283,40 @@ class Locomotion:
         return state
 
     def descriptions(self, robot: int, designs) -> Descriptions:
-        """Descriptions [S, ...] of designs [S, d] of robot number `robot`, padded to this batch."""
-        return self._bodies(self.groups[robot], designs)[0]
+        """Descriptions [S, ...] of designs [S, d] of robot number `robot`, padded to this batch.
+
+        Raises:
+            ValueError: for designs of another shape, outside [-1, 1] or not finite.
+        """
+        group = self.groups[robot]
+        designs = group.space.validate(designs)
+        if designs.ndim != 2 or len(designs) == 0:
+            raise ValueError(
+                f"designs have shape {designs.shape}; expected at least one row of "
+                f"[S, {group.space.dim}]"
+            )
+        return self._bodies(group, designs)[0]
+
+    def _validated(self, designs, count: int, rows=None):
+        """Designs [count, D] of environments `rows` (all if not given), from as many or one [D].
+
+        D is the largest robot's; numbers beyond a robot's own d are padding and may be anything.
+        """
+        designs, dim = np.asarray(designs, np.float32), self.design_dim
+        if designs.shape not in ((dim,), (1, dim), (count, dim)):
+            raise ValueError(
+                f"designs have shape {designs.shape}; expected one design [{dim}] or one per "
+                f"environment [{count}, {dim}], padded to the length of the largest robot's"
+            )
+        designs = np.broadcast_to(designs, (count, dim))
+        rows = np.arange(count) if rows is None else rows
+        for group in self.groups:
+            own = (rows >= group.first) & (rows < group.first + group.count)
+            try:
+                group.space.validate(designs[own, : group.space.dim])
+            except ValueError as error:
+                raise ValueError(f"designs of robot {group.robot.name!r}: {error}") from error
+        return designs
 
     def _bodies(self, group, designs):
         """Descriptions and embodiments of designs [S, d], as NumPy arrays.
@@ -358,15 +394,20 @@ class Locomotion:
 
         Returns:
             The new state.
+
+        Raises:
+            ValueError: for designs of another shape, outside [-1, 1] or not finite.
         """
         rows, keys = np.asarray(rows), np.asarray(keys)
+        if designs is not None:
+            designs = self._validated(designs, len(rows), rows)
         coefficient = np.broadcast_to(np.asarray(coefficient, np.float32), rows.shape)
         streak = np.broadcast_to(np.asarray(streak, np.int32), rows.shape)
         for group in self.groups:
             own = (rows >= group.first) & (rows < group.first + group.count)
             if not own.any():
                 continue
-            f = None if designs is None else np.asarray(designs)[own, : group.space.dim]
+            f = None if designs is None else designs[own, : group.space.dim]
             ids = rows[own] - group.first
             fresh = self._begin(group, ids, keys[own], f, coefficient[own], streak[own])
             fresh = jax.tree.map(lambda *x: np.concatenate(x), *fresh)

@@ -145,8 +145,11 @@ def require(config, expected: str, valid: Callable[[float], bool], *names: str) 
 
 def require_integers(config, *names: str, least: int = 1) -> None:
     """ValueError naming the first of the settings `names` that is not an integer from `least`."""
-    expected = f"an integer from {least} up"
-    require(config, expected, lambda x: x == x // 1 and least <= x < float("inf"), *names)
+    for name in names:
+        value = getattr(config, name)
+        integer = isinstance(value, numbers.Integral) and not isinstance(value, bool)
+        if not integer or value < least:
+            raise ValueError(f"{name} is {value!r}; expected an integer from {least} up")
 
 
 def require_positive(config, *names: str) -> None:

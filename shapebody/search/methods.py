@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import dataclasses
 import difflib
+import hashlib
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -74,7 +75,9 @@ class SearchResult:
             kind (method, settings, robot, size of the critic; VGDS also: number of starts) ran
             before.
         method: name of the method.
-        settings: all settings, including trust_region, seed, batch_size and the agent's hash.
+        settings: all settings, including trust_region, seed, batch_size and the agent's hash;
+            reference is None if it was not given, else the first 16 digits of the SHA-256 of f_ref
+            as float32; states_hash is that of the agent's states, or of those given instead.
     """
 
     design: np.ndarray
@@ -155,14 +158,28 @@ def search(
         settings={
             **dataclasses.asdict(config),
             "trust_region": float(trust_region),
+            "reference": None if reference is None else _short_hash(objective.reference),
             "seed": seed,
             "batch_size": objective.batch_size,
             "states": objective.num_states,
+            "states_hash": _states_hash(agent, states),
             "robot": robot.name,
             "agent": agent.name,
             "agent_hash": agent.hash,
         },
     )
+
+
+def _short_hash(design) -> str:
+    return hashlib.sha256(np.asarray(design, "<f4").tobytes()).hexdigest()[:16]
+
+
+def _states_hash(agent: Agent, states: Observation | None) -> str | None:
+    """SHA-256 of the agent's state bank, or of the `states` that were given instead."""
+    if states is not None:
+        owners = np.zeros(len(states.general), np.int32)
+        agent = dataclasses.replace(agent, states=states, state_robots=owners)
+    return agent.states_hash
 
 
 class _Compilation:
