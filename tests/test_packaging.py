@@ -1,3 +1,4 @@
+import json
 import re
 import subprocess
 import sys
@@ -77,3 +78,24 @@ def test_unknown_name_suggests_close_ones():
 
 def test_dir_lists_the_public_names():
     assert set(shapebody.__all__) <= set(dir(shapebody))
+
+
+def test_readme_states_the_measured_speeds():
+    readme = (ROOT / "README.md").read_text()
+    rows = json.loads((ROOT / "benchmarks" / "results.json").read_text())["rows"]
+    for label, digits in (
+        ("C engine alone", 0),
+        ("environment, C engine", 0),
+        ("environment, MJX on cpu, 64 at once", 0),
+        ("training, reduced", 0),
+        ("VGDS, one design", 2),
+        ("VGDS, ten designs", 2),
+        ("cem, ten designs", 1),
+        ("turbo, ten designs", 1),
+        ("gc-pfo, ten designs", 1),
+    ):
+        text = f"| {rows[label]['value']:,.{digits}f} "
+        assert text in readme, f"README.md should have {text}for {label!r}"
+    for label in ("cma-es", "pso", "de", "ars"):
+        likewise = rows[f"{label}, ten designs"]["value"] / rows["cem, ten designs"]["value"]
+        assert 0.8 < likewise < 1.25, label
