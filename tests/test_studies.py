@@ -93,6 +93,15 @@ def test_records_are_what_search_and_evaluation_give(results, agent, robot):
     assert studies.gain(rows, "cem", "penalty-only", 100.0)["pairs"] == 2
 
 
+@pytest.mark.skipif(not studies.installed((Run("bo"),)), reason="BoTorch is not installed")
+def test_evaluations_along_the_curve_of_bo(results, agent, robot):
+    """BO has scored its first points before its first iteration."""
+    records = design_study(agent, robot, (Run("bo"),), **dict(SETTING, starts=1))["records"]
+    first = METHODS["bo"].config().initial_points
+    assert records[-1]["evaluations"] == first + 2
+    assert records[-1]["curve_evaluations"] == [0, first + 1, first + 2]
+
+
 def test_what_is_stored_is_not_computed_again(results, agent, robot, monkeypatch):
     first = design_study(agent, robot, RUNS[:2], **SETTING)
     searched = []
