@@ -93,6 +93,7 @@ def test_readme_states_the_measured_speeds():
         ("cem, ten designs", 1),
         ("turbo, ten designs", 1),
         ("gc-pfo, ten designs", 1),
+        ("bo, ten designs", 0),
     ):
         text = f"| {rows[label]['value']:,.{digits}f} "
         assert text in readme, f"README.md should have {text}for {label!r}"
