@@ -204,7 +204,7 @@ class Locomotion:
 
             for group in self.groups:
                 group.physics = MjxPhysics(group.robot, group.count, **options)
-        self._advance_jit = jax.jit(self._advance)
+        self._account = jax.jit(self._moving_part)
         self._steps: dict[Any, Callable] = {}
         self.physics_state = None
 
@@ -225,6 +225,11 @@ class Locomotion:
             state, outcome.terminated
         )
         return state, outcome, (coefficient, streak, _next_key(state.key))
+
+    def _moving_part(self, state: Episode, raw):
+        """`_advance` without what an episode keeps: a compiled function would copy its results."""
+        state, *others = self._advance(state, raw)
+        return replace(state, design=None, descriptions=None), *others
 
     # ------------------------------------------------------------------ reset
 
@@ -352,7 +357,7 @@ class Locomotion:
                 )
         other = copy.copy(self)
         other.config = config
-        other._advance_jit = jax.jit(other._advance)
+        other._account = jax.jit(other._moving_part)
         other._steps = {}
         return other
 
@@ -410,9 +415,10 @@ class Locomotion:
             f = None if designs is None else designs[own, : group.space.dim]
             ids = rows[own] - group.first
             fresh = self._begin(group, ids, keys[own], f, coefficient[own], streak[own])
-            fresh = jax.tree.map(lambda *x: np.concatenate(x), *fresh)
+            if len(fresh) > 1:
+                fresh = [jax.tree.map(lambda *x: np.concatenate(x), *fresh)]
             state = jax.tree.map(
-                lambda old, new, at=rows[own]: _replaced(old, at, new), state, fresh
+                lambda old, new, at=rows[own]: _replaced(old, at, new), state, *fresh
             )
         return state
 
@@ -438,8 +444,8 @@ class Locomotion:
             return self._rollout_mjx(policy, params, state, key, length)
         first = state.descriptions
         records = []
-        for t in range(length):
-            state, record, _ = self.step(policy, params, state, jax.random.fold_in(key, t))
+        for step_key in _step_keys(key, length):
+            state, record, _ = self.step(policy, params, state, step_key)
             records.append(record)
         stacked = jax.tree.map(lambda *x: np.stack(x), *records)
         return state, self._trajectory(stacked, first, state)
@@ -447,8 +453,10 @@ class Locomotion:
     def step(self, policy: Policy, params, state: Episode, key):
         """One control step with the native engine: (state, StepRecord of numpy arrays, Outcome)."""
         act = self._compiled(policy)
-        state, observation, action, extra, target, trunk, velocity = act(params, state, key)
-        target, trunk, velocity = np.asarray(target), np.asarray(trunk), np.asarray(velocity)
+        moved, targets, observation, action, extra = act(params, state, key)
+        target, trunk, velocity = map(np.asarray, targets)
+        design, descriptions = state.design, state.descriptions
+        state = replace(state, **moved)
         raw = []
         for group in self.groups:
             physics, s, nu = group.physics, group.slice, group.robot.num_actuators
@@ -456,7 +464,8 @@ class Locomotion:
             physics.qvel[:, group.qvel_index] = velocity[s, :nu]
             qpos, qvel, sensordata, finite = physics.step(target[s, :nu])
             raw.append((_f32(qpos), _f32(qvel), _f32(sensordata), np.array(finite)))
-        state, outcome, following = self._advance_jit(state, tuple(raw))
+        state, outcome, following = self._account(state, tuple(raw))
+        state = replace(state, design=design, descriptions=descriptions)
         record = _record(state, observation, action, extra, outcome)
         record = jax.tree.map(np.asarray, record)
         done = record.terminated | record.truncated
@@ -472,8 +481,9 @@ class Locomotion:
             def act(params, state, key):
                 state, observation = self._observe(state)
                 action, extra = policy(params, key, state.descriptions, observation)
-                state, target, trunk, velocity = self._control(state, action)
-                return state, observation, action, extra, target, trunk, velocity
+                state, *targets = self._control(state, action)
+                moved = {"clock": state.clock, "actions": state.actions}
+                return moved, targets, observation, action, extra
 
             self._steps[policy] = jax.jit(act)
         return self._steps[policy]
@@ -597,6 +607,12 @@ def _replaced(old, rows, new):
     result = np.array(old)
     result[rows] = new
     return result
+
+
+@partial(jax.jit, static_argnums=1)
+def _step_keys(key, length: int):
+    """A key for each step of a rollout."""
+    return jax.vmap(lambda t: jax.random.fold_in(key, t))(jnp.arange(length))
 
 
 @jax.jit
