@@ -197,6 +197,22 @@ def stored_parts(name: str, agent=None, **config) -> list[str]:
     return list(_known_parts(result_path(name), agent, config, overwrite=False))
 
 
+def stored_config(name: str, agent=None) -> dict | None:
+    """The settings of the stored result of that name and agent; None where there is none.
+
+    A damaged file has none: whoever wants its records is told.
+    """
+    path = result_path(name)
+    if scale() == "smoke" or not path.exists():
+        return None
+    try:
+        part = next(iter(json.loads(path.read_text())["parts"].values()))
+        config = part["provenance"]["config"]
+        return config if _known_parts(path, agent, config, overwrite=True) else None
+    except (json.JSONDecodeError, KeyError, TypeError, AttributeError, StopIteration):
+        return None
+
+
 def result_path(name: str) -> Path:
     """Where `result` keeps that experiment at the scale in force."""
     suffix = "" if scale() == "reduced" else f"_{scale()}"

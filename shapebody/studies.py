@@ -17,6 +17,7 @@ from shapebody.experiments import (
     result,
     result_in_parts,
     result_path,
+    stored_config,
     stored_parts,
     stored_result,
 )
@@ -77,7 +78,8 @@ def design_study(
         agent, robot: who is asked, and about which robot.
         runs: the searches.
         starts: number of start designs.
-        episodes: evaluation episodes per design.
+        episodes: least number of evaluation episodes per design. A stored study of more is used
+            as it is, and what it lacks is computed with as many; to have fewer, delete its file.
         seed: of the searches and of the evaluation.
         iterations: of every search; the paper's number for each method if not given.
         first_start: number of the first start design. The paper's are 0 to 9; others have a file
@@ -105,10 +107,11 @@ def design_study(
     short = {} if iterations is None else {"iterations": iterations}
     for run in runs:
         _validate(run, short)
+    name = _file(robot, first_start)
+    setting = _as_stored(name, agent, setting, short)
     parts = {"starts and reference": partial(_initial_records, agent, robot, **setting)}
     for run in runs:
         parts[_part(run)] = partial(_run_records, agent, robot, run, short, **setting)
-    name = _file(robot, first_start)
     return result_in_parts(name, parts, agent, recompute, progress, **setting, **short)
 
 
@@ -116,6 +119,14 @@ def _setting(starts, episodes, horizon, seed, first_start) -> dict:
     """What a stored study depends on; `first_start` is named only where it is not 0."""
     setting = dict(starts=starts, episodes=episodes, horizon=horizon, seed=seed)
     return setting if first_start == 0 else setting | {"first_start": first_start}
+
+
+def _as_stored(name, agent, setting: dict, short: dict) -> dict:
+    """The setting with the number of episodes of the stored study, if that is larger."""
+    stored = stored_config(name, agent) or {}
+    episodes = stored.get("episodes", 0)
+    same = stored == setting | short | {"episodes": episodes}
+    return setting | {"episodes": episodes} if same and episodes > setting["episodes"] else setting
 
 
 def _validate(run: Run, settings: dict) -> None:
@@ -172,6 +183,7 @@ def available(
     setting = _setting(starts, episodes, horizon, seed, first_start)
     short = {} if iterations is None else {"iterations": iterations}
     name = _file(robot, first_start)
+    setting = _as_stored(name, agent, setting, short)
     stored = [] if recompute else stored_parts(name, agent, **setting, **short)
     here = installed(runs)
     return tuple(run for run in runs if run in here or _part(run) in stored)

@@ -122,6 +122,23 @@ def test_what_is_stored_is_not_computed_again(results, agent, robot, monkeypatch
     assert len(json.loads(path.read_text())["parts"]) == 4
 
 
+def test_a_study_of_more_episodes_is_used_and_completed_with_as_many(results, agent, robot):
+    first = design_study(agent, robot, RUNS[:1], **SETTING)
+    fewer = dict(SETTING, episodes=2)
+    both = design_study(agent, robot, RUNS[:2], **fewer)
+    assert both["records"][:5] == first["records"]
+    assert {len(record["returns"]) for record in both["records"]} == {3}
+    again = design_study(agent, robot, RUNS[:1], recompute=True, **fewer)
+    assert again["records"][0]["returns"] == first["records"][0]["returns"]
+    stored = results / f"design_study_{robot.name}_{robot.hash}.json"
+    # More episodes than stored, or other starts, are another study.
+    more = design_study(agent, robot, RUNS[:1], **dict(SETTING, episodes=4))
+    assert {len(record["returns"]) for record in more["records"]} == {4}
+    assert [path.name for path in results.glob("*.old.json")] == [stored.stem + ".old.json"]
+    other = design_study(agent, robot, RUNS[:1], **dict(fewer, starts=1))
+    assert {len(record["returns"]) for record in other["records"]} == {2}
+
+
 def test_other_starts_have_their_own_file(results, agent, robot):
     runs = (CONTROL, Run("vgds", 20.0))
     own = design_study(agent, robot, runs, **dict(SETTING, starts=3))["records"]
@@ -196,6 +213,7 @@ def test_available_runs_are_installed_or_stored(results, agent, robot, monkeypat
     )
     design_study(agent, robot, runs[1:2], **SETTING)
     assert studies.available(agent, robot, runs, **SETTING) == runs
+    assert studies.available(agent, robot, runs, **dict(SETTING, episodes=2)) == runs
     for other in (dict(SETTING, starts=3), dict(SETTING, recompute=True)):
         assert studies.available(agent, robot, runs, **other) == (CONTROL, runs[2])
     monkeypatch.setenv("SHAPEBODY_SCALE", "smoke")
