@@ -129,30 +129,37 @@ def _anneal(options):
 
 
 def _sharpen(options):
-    from shapebody.checkpoints import load_agent
+    from shapebody.checkpoints import agent_folder, load_agent
     from shapebody.networks import CriticConfig
     from shapebody.ppo import train_critic
 
     agent = load_agent(options.agent)
-    critic = CriticConfig() if agent.metadata["scale"] == "full" else CriticConfig.sharp()
-    seconds = None if options.hours is None else 3600 * options.hours
-    sharper = train_critic(agent, critic, options.steps, max_seconds=seconds, engine=options.engine)
+    full = agent.metadata.get("scale") == "full"
+    sharper = train_critic(
+        agent,
+        CriticConfig() if full else CriticConfig.sharp(),
+        options.steps,
+        folder=agent_folder(options.agent),
+        max_seconds=None if options.hours is None else 3600 * options.hours,
+        engine=options.engine,
+    )
     if sharper is agent:
         print("not finished: the agent is as it was, the same command continues")
 
 
 def _design(options):
-    from pathlib import Path
-
     import numpy as np
 
     from shapebody.checkpoints import load_agent
     from shapebody.design import DesignSpace
+    from shapebody.files import atomic_write
     from shapebody.robots import load_robot
     from shapebody.search import Objective, search
 
     robot = load_robot(options.robot)
+    _check_out(options.out, robot)
     agent = load_agent(options.agent or robot.name)
+    _warn_of_another_file(agent, robot)
     space = DesignSpace(robot)
     f = space.reference if options.start is None else space.start(options.start)
     found = search(
@@ -165,8 +172,36 @@ def _design(options):
         change = float(np.sqrt(np.mean(found.design[index] ** 2)))
         print(f"  {label:32s} RMS change from the reference {change:.3f}")
     if options.out:
-        Path(options.out).write_text(space.to_mjcf(found.design))
-        print(f"wrote {options.out}")
+        print(f"wrote {atomic_write(options.out, space.to_mjcf(found.design))}")
+
+
+def _check_out(out, robot) -> None:
+    """Before a search: whether its result can be written."""
+    from pathlib import Path
+
+    if out is None:
+        return
+    path = Path(out)
+    if path.is_dir():
+        raise ValueError(f"--out is {out}, a folder; give the name of a file")
+    if path.exists() and robot.path is not None and path.samefile(robot.path):
+        raise ValueError(
+            f"--out is {out}, the file of the robot itself, whose reference body would be lost; "
+            "give another name"
+        )
+    path.absolute().parent.mkdir(parents=True, exist_ok=True)
+
+
+def _warn_of_another_file(agent, robot) -> None:
+    """Say so if the robot's file is not the one on which the agent was trained."""
+    phases = agent.metadata.get("phases") or [{}]
+    known = phases[0].get("robots", {}).get(robot.name, robot.hash)
+    if known != robot.hash:
+        print(
+            f"shapebody: warning: the file of robot {robot.name} is not the one on which agent "
+            f"{agent.name} was trained; what it says of other bodies is a guess",
+            file=sys.stderr,
+        )
 
 
 def _validate(options) -> int:
@@ -190,7 +225,10 @@ def _evaluate(options):
     from shapebody.robots import load_robot
 
     agent = load_agent(options.agent)
-    robot = load_robot(options.robot or agent.metadata["config"]["robots"][0])
+    # Its configuration has the files of robots that are not among the shipped ones.
+    trained = agent.metadata.get("config", {}).get("robots", agent.robots)
+    robot = load_robot(options.robot or trained[0])
+    _warn_of_another_file(agent, robot)
     space = DesignSpace(robot)
     f = space.reference if options.start is None else space.start(options.start)
     score = evaluate(

@@ -60,6 +60,7 @@ from .paths import data_dir
 
 __all__ = [
     "Agent",
+    "agent_folder",
     "agents",
     "atomic_write",
     "check_agent",
@@ -74,7 +75,6 @@ __all__ = [
 FORMAT = 1
 WEIGHTS, DESCRIPTION, STATES, CURVE = "weights.safetensors", "agent.json", "states.npz", "curve.csv"
 _CONFIGURATION = ("robots", "sizes", "policy_config", "critic_config")
-_BROKEN_ZIP = (zipfile.BadZipFile, zlib.error)
 _PACKAGES = ("shapebody", "jax", "flax", "optax", "mujoco", "numpy")
 
 
@@ -282,7 +282,7 @@ def load_agent(name_or_folder: str | Path) -> Agent:
             edited, of another version or do not fit together.
         FileNotFoundError: for a missing folder or file.
     """
-    folder = _find(name_or_folder)
+    folder = agent_folder(name_or_folder)
     document = _read_description(folder)
     restore = f"restore the folder, for example with 'git checkout -- {folder}', or train anew"
     try:
@@ -310,6 +310,11 @@ def load_agent(name_or_folder: str | Path) -> Agent:
             f"belongs to another agent; {restore}"
         )
     states, state_robots = None, None
+    if states_hash is None and (folder / STATES).exists():
+        raise ValueError(
+            f"{DESCRIPTION} says that the agent has no state bank, but there is {folder / STATES}: "
+            f"{DESCRIPTION} was edited, or the other file is of another agent; {restore}"
+        )
     if states_hash is not None:
         states, state_robots = _read_states(folder / STATES, states_hash, restore)
     agent = Agent(
@@ -339,7 +344,7 @@ def load_curve(name_or_folder: str | Path) -> dict[str, np.ndarray]:
 
     Raises FileNotFoundError if the agent has none.
     """
-    path = _find(name_or_folder) / CURVE
+    path = agent_folder(name_or_folder) / CURVE
     if not path.is_file():
         raise FileNotFoundError(f"{path} does not exist: this agent has no learning curve")
     return read_curve(path)
@@ -385,7 +390,8 @@ def check_agent(agent: Agent) -> None:
         )
 
 
-def _find(name_or_folder: str | Path) -> Path:
+def agent_folder(name_or_folder: str | Path) -> Path:
+    """The folder of an agent that is given as in `load_agent`; raises what that raises."""
     text = str(name_or_folder)
     if isinstance(name_or_folder, Path) or os.sep in text or "/" in text:
         folder = Path(name_or_folder).expanduser()

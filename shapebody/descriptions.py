@@ -1,7 +1,8 @@
 """Static descriptions of an embodiment: what the networks are told about joints, feet and body.
 
 Pure JAX: forward kinematics of one design at its nominal pose, then the normalized description
-vectors of Appendix A. Nothing here needs a physics engine, and everything is differentiable.
+vectors of Appendix A. All that depends on the design is differentiable and needs no physics engine;
+MuJoCo's kinematics are asked once per robot, for which foot mirrors which.
 """
 
 from __future__ import annotations
@@ -20,7 +21,6 @@ from shapebody.robots import Robot
 
 JOINT_DESCRIPTION = 30
 FOOT_DESCRIPTION = 21
-STATIC_DESCRIPTION = 14
 FOOT_SIZE_SCALE = 0.15  # m
 
 

@@ -15,6 +15,7 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
+from shapebody.checks import require_integer
 from shapebody.mjcf import build_model, write_mjcf
 from shapebody.parameters import (
     BLOCKS,
@@ -25,7 +26,7 @@ from shapebody.parameters import (
     part_name,
     soft_limits,
 )
-from shapebody.robots import Robot
+from shapebody.robots import Robot, require_robot
 
 
 @jax.tree_util.register_dataclass
@@ -143,7 +144,7 @@ class DesignSpace:
     """
 
     def __init__(self, robot: Robot, axes_seed: int = 0, published_axes_of=None):
-        self.robot = robot
+        self.robot = require_robot(robot)
         counts = {
             "global": 1,
             "body": robot.num_bodies,
@@ -186,6 +187,7 @@ class DesignSpace:
 
     def start(self, seed: int) -> np.ndarray:
         """Start design number `seed` of the paper: float32 [d], uniform in [-1, 1]."""
+        require_integer("the number of a start design", seed)
         return np.random.default_rng(seed).uniform(-1, 1, self.dim).astype(np.float32)
 
     def validate(self, f) -> np.ndarray:
@@ -261,8 +263,9 @@ class DesignSpace:
         """Indices into f by label: first every parameter type of `KINDS`, then every body part.
 
         Types partition f, and so do parts (`parts`): bodies, joints, actuators and feet under their
-        `part_label` in alphabetical order, then "Trunk" and "Global". As in the paper's figure;
-        a joint and a body of the same label share a part.
+        `part_label` in alphabetical order, then "Trunk" and "Global". The paper's figure
+        (Section 4.3) has separate columns for a joint and a body of the same label (two for "FL
+        calf" of the Go2, 30 in all); here they share a part (18 in all).
         """
         kinds: dict[str, list[int]] = {kind: [] for kind in KINDS}
         parts: dict[str, list[int]] = {}

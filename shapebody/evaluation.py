@@ -14,6 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from shapebody.checkpoints import Agent
+from shapebody.checks import require_integer, require_kind
 from shapebody.design import DesignSpace
 from shapebody.locomotion import Locomotion, TaskConfig
 from shapebody.locomotion.env import RESET_SLOTS
@@ -43,12 +44,10 @@ class EvaluationConfig:
 
     def __post_init__(self):
         for name in ("episodes", "num_envs"):
-            value = getattr(self, name)
-            integer = isinstance(value, numbers.Integral) and not isinstance(value, bool)
-            if not integer or value < 1:
-                raise ValueError(f"{name} is {value!r}; expected an integer of at least 1")
+            require_integer(name, getattr(self, name), 1)
         if not isinstance(self.coefficient, numbers.Real) or not 0 <= self.coefficient <= 1:
             raise ValueError(f"coefficient is {self.coefficient!r}; expected a number in [0, 1]")
+        require_kind("task", self.task, TaskConfig, "TaskConfig.evaluation(...)")
 
 
 @dataclass(frozen=True, eq=False)
@@ -136,7 +135,9 @@ def evaluate(
         designs: normalized designs in [-1, 1].
         episodes: episodes per design; 200 unless `config` says otherwise.
         seed: of the episodes.
-        engine: "native", "mjx" or "auto" (native on a CPU).
+        engine: "native", "mjx" or "auto" (native on a CPU). Besides the arithmetic, their solvers
+            differ: "mjx" stops after 4 Newton and 8 line-search iterations (`MjxPhysics`),
+            "native" after those of the robot's file.
         config: everything else.
         progress: print how far it is.
 
@@ -147,6 +148,7 @@ def evaluate(
     config = config or EvaluationConfig()
     if episodes is not None:
         config = dataclasses.replace(config, episodes=episodes)
+    require_integer("seed", seed)
     space = DesignSpace(robot)
     designs = space.validate(designs)
     if designs.ndim > 2 or len(designs) == 0:
@@ -340,6 +342,12 @@ def _environment(
     recompute_constants: bool = False,
 ) -> Locomotion:
     options = {"recompute_constants": True} if recompute_constants else None
+    native = engine == "native" or (engine == "auto" and jax.default_backend() == "cpu")
+    if recompute_constants and not native:
+        raise ValueError(
+            "recompute_constants is True, which only the native engine can do; pass "
+            "engine='native', or leave it False"
+        )
     return Locomotion(robot, num_envs, engine, task, auto_reset=False, physics_options=options)
 
 

@@ -44,7 +44,7 @@ BUDGETS = {
     "reduced": Budget(10, 50, 50, None, 256, 8, 400_000, 6.0, 12, 1000),
     "full": Budget(10, 200, 200, None, 256, 32, 20_000_000, 10.0, 12, 1000),
 }
-"""The table of scales. The method is the same at all of them."""
+"""Budgets by scale. What training changes beside sizes is in `scales_table`."""
 
 
 def scale() -> str:
@@ -296,33 +296,30 @@ def rank_correlation(x, y, resamples: int = 2000, seed: int = 0) -> tuple[float,
 
 
 def scales_table() -> list[dict]:
-    """All that differs between the scales, one record per scale."""
+    """All that differs between the scales: one record per scale, with the fields of `Budget` and
+    those of `TrainConfig` that are not the same at all of them.
+
+    Beside sizes and budgets, these are three settings of training: `reduced` and `smoke`
+    standardize the networks' inputs, give the critic's targets a larger λ, and end the policy's
+    advantages where the command changes.
+    """
     from shapebody.ppo import TrainConfig
 
-    rows = []
-    for name, one in BUDGETS.items():
-        config = TrainConfig.at_scale(name, "unitree_go2")
-        rows.append(
-            {
-                "scale": name,
-                "environments": config.num_envs,
-                "rollout": config.rollout_length,
-                "minibatch": config.minibatch_size,
-                "epochs": config.epochs,
-                "training steps": config.total_steps,
-                "learning rate": config.learning_rate,
-                "policy": asdict(config.policy),
-                "critic": asdict(config.critic),
-                **asdict(one),
-            }
-        )
-    return rows
+    configs = {name: asdict(TrainConfig.at_scale(name, "unitree_go2")) for name in BUDGETS}
+    first = configs["full"]
+    names = [x for x in first if any(one[x] != first[x] for one in configs.values())]
+    return [
+        {"scale": name, **{x: configs[name][x] for x in names}, **asdict(one)}
+        for name, one in BUDGETS.items()
+    ]
 
 
 def derived_constants(
-    agent, robot, starts: int = 10, episodes: int = 16, seed: int = 0
+    agent, robot, starts: int = 10, episodes: int = 16, seed: int = 0, horizon: int = 1000
 ) -> list[dict]:
     """How much returns depend on MuJoCo's derived constants (`body_invweight0` and the like).
+
+    data/results/derived_constants_go2.json is `result("derived_constants_go2", ...)` of this.
 
     The paper's environment leaves them at the reference when a body changes, and so do we; the
     native engine can recompute them for every design.
@@ -333,6 +330,7 @@ def derived_constants(
     """
     from shapebody.design import DesignSpace
     from shapebody.evaluation import EvaluationConfig, evaluate
+    from shapebody.locomotion import TaskConfig
 
     space = DesignSpace(robot)
     designs = np.stack([space.reference] + [space.start(i) for i in range(starts)])
@@ -344,7 +342,9 @@ def derived_constants(
             episodes=episodes,
             seed=seed,
             engine="native",
-            config=EvaluationConfig(recompute_constants=value),
+            config=EvaluationConfig(
+                recompute_constants=value, task=TaskConfig.evaluation(horizon=horizon)
+            ),
         ).returns
         for value in (False, True)
     )

@@ -3,14 +3,16 @@
 A robot is a set of joints and a set of feet, each with a description d and an observation o. Every
 part is encoded on its own and the parts are summed, so one network serves any number of them:
 
-    latent = sum over parts of softmax(key(d, o) / temperature) outer value
+    latent = sum over parts of softmax(tanh(key(d, o)) / temperature) outer value
 
 The value is a function of o in the policy and in the original critic, and of (d, o) in the
 direct-design critic. The sum, together with the general observations, enters a core network.
 
-The key layer sees the observation as well as the description, as in the published policies; eq. (3)
-writes the description only. Its first layer is linear in [d, o], so `embed` computes the part that
-depends on the design once, and `act` (or `value`) adds the rest for every state of that design.
+As in the published policies, the key layer sees the observation as well as the description, its
+output passes a tanh, and key and value meet in an outer product; eq. (3) writes the description
+only, no tanh and an elementwise product. The first key layer is linear in [d, o], so `embed`
+computes the part that depends on the design once, and `act` (or `value`) adds the rest for every
+state of that design.
 
 Inputs are read by attribute: descriptions need joints [..., J, 30], joint_mask [..., J],
 feet [..., F, 21], foot_mask [..., F] and static [..., 14]; observations need joints [..., J, 4],

@@ -47,9 +47,6 @@ PPO = {
 POLICY = {"initial_std": 1.0, "mean_limit": 10.0, "std_limits": (0.01, 2.0)}
 """Settings of the action distribution, named as the fields of `PolicyConfig` (Appendix A)."""
 
-STARTS = 10
-"""Start designs per robot (Section 4.1)."""
-
 SINGLE_ROBOT = {
     "unitree_go2": {
         "GC-PFO": 20.6,
@@ -210,7 +207,8 @@ RL_CODESIGN = {
         "Stackelberg PPO": 13.4,
     },
 }
-"""Final returns after 10⁹ environment steps from one start (Section 4.1, read off)."""
+"""Final returns after 10⁹ environment steps (Section 4.1, read off; the number of starts is not
+given)."""
 
 SPEARMAN = {"all": 0.40, "mit_humanoid": 0.50, "unitree_go2": 0.60, "golem": 0.83}
 """Rank correlation of predicted value and return over 17 partially modified designs (Appendix,

@@ -38,6 +38,7 @@ from shapebody.checkpoints import (
     save_agent,
     save_arrays,
 )
+from shapebody.checks import require_integer, require_kind
 from shapebody.files import read_safetensors
 from shapebody.locomotion import Locomotion, TaskConfig, Trajectory
 from shapebody.locomotion.observations import COMMAND, Observation
@@ -54,6 +55,9 @@ from shapebody.networks import (
 from shapebody.paths import data_dir
 from shapebody.robots import load_robot
 from shapebody.runtime import keep_memory
+
+SCALES = ("smoke", "reduced", "full")
+"""Names of the sizes at which everything can be computed."""
 
 
 @dataclass(frozen=True)
@@ -103,7 +107,8 @@ class TrainConfig:
     """States kept for design search."""
 
     def __post_init__(self):
-        robots = (self.robots,) if isinstance(self.robots, str) else tuple(self.robots)
+        robots = (self.robots,) if isinstance(self.robots, str | Path) else tuple(self.robots)
+        robots = tuple(str(robot) for robot in robots)
         object.__setattr__(self, "robots", robots)
         if not robots:
             raise ValueError("robots is (); expected at least one name or path")
@@ -120,14 +125,20 @@ class TrainConfig:
         counts = ("num_envs", "rollout_length", "total_steps", "minibatch_size", "epochs")
         for name in (*counts, "state_bank"):
             value = getattr(self, name)
-            if type(value) is not int or value < 1:
-                raise ValueError(f"{name} is {value!r}; expected a positive integer")
+            object.__setattr__(self, name, require_integer(name, value, 1))
         for name in ("discount", "gae_lambda", "value_lambda"):
             value = getattr(self, name)
             if not _is_number(value, 1) and (name, value) != ("value_lambda", None):
                 raise ValueError(f"{name} is {value!r}; expected a number from 0 to 1")
-        if type(self.seed) is not int or self.seed < 0:
-            raise ValueError(f"seed is {self.seed!r}; expected an integer of at least 0")
+        object.__setattr__(self, "seed", require_integer("seed", self.seed))
+        for name, kind in (("policy", PolicyConfig), ("critic", CriticConfig)):
+            hint = f"shapebody.{kind.__name__}.reduced(...)"
+            require_kind(name, getattr(self, name), kind, hint)
+        require_kind("task", self.task, TaskConfig, "shapebody.TaskConfig(...)")
+        for name in ("standardize", "cut_at_commands", "learn_policy"):
+            require_kind(name, getattr(self, name), bool, "True or False")
+        if self.scale not in SCALES:
+            raise ValueError(f"scale is {self.scale!r}; expected one of {', '.join(SCALES)}")
         if not _is_number(self.entropy_coefficient, math.inf):
             raise ValueError(
                 f"entropy_coefficient is {self.entropy_coefficient!r}; expected a number of at "
@@ -166,7 +177,7 @@ class TrainConfig:
 
     @classmethod
     def full(cls, robot: str, **changes) -> "TrainConfig":
-        """The paper's networks and hyperparameters, for a GPU."""
+        """The paper's networks and single-robot hyperparameters, for a GPU."""
         name = f"{_default_name(robot, changes)}_full"
         return cls(**{"name": name, "robots": (robot,), **changes})
 
@@ -217,10 +228,9 @@ class TrainConfig:
     @classmethod
     def at_scale(cls, scale: str, robot: str, **changes) -> "TrainConfig":
         """`smoke`, `reduced` or `full` by name."""
-        makers = {"smoke": cls.smoke, "reduced": cls.reduced, "full": cls.full}
-        if scale not in makers:
-            raise ValueError(f"scale is {scale!r}; expected one of {', '.join(makers)}")
-        return makers[scale](robot, **changes)
+        if scale not in SCALES:
+            raise ValueError(f"scale is {scale!r}; expected one of {', '.join(SCALES)}")
+        return getattr(cls, scale)(robot, **changes)
 
 
 def _default_name(robot: str, changes: dict) -> str:
@@ -800,6 +810,7 @@ def train(
     if not (state_only or replace) and begun < trainer.last_iteration(max_steps) * config.batch:
         others = ", state_only=True (--state-only) to leave it, or choose another name or folder"
         _keep_agent(trainer.folder, begun, others)
+        _keep_critic(trainer.folder, others)
     _run(trainer, progress, max_steps, max_seconds)
     if state_only:
         return None
@@ -812,15 +823,22 @@ STATE_FILES = ("training.safetensors", "training.json", "training.csv")
 """A run in its folder: its state, its configurations and its learning curve."""
 
 
-def _agent_steps(folder: Path) -> int | None:
-    """Steps of the agent in a folder: None if there is no agent, 0 if it does not say."""
+def _metadata(folder: Path) -> dict | None:
+    """Metadata of the agent in a folder: None if there is no agent, {} if they are unreadable."""
     path = folder / "agent.json"
     if not path.exists():
         return None
     try:
-        return int(json.loads(path.read_text())["metadata"]["steps"])
+        metadata = json.loads(path.read_text())["metadata"]
+        return metadata | {"steps": int(metadata["steps"])}
     except (ValueError, LookupError, TypeError):
-        return 0
+        return {}
+
+
+def _agent_steps(folder: Path) -> int | None:
+    """Steps of the agent in a folder: None if there is no agent, 0 if it does not say."""
+    metadata = _metadata(folder)
+    return None if metadata is None else metadata.get("steps", 0)
 
 
 def _keep_agent(folder: Path, steps: int, others: str = "") -> None:
@@ -831,6 +849,16 @@ def _keep_agent(folder: Path, steps: int, others: str = "") -> None:
         raise ValueError(
             f"the agent in {folder} has {kept:,} steps, the run that would replace it {steps:,}; "
             f"pass replace=True (--replace) to replace it{others}"
+        )
+
+
+def _keep_critic(folder: Path, others: str) -> None:
+    """Raise ValueError if the agent in a folder has a critic from policy evaluation."""
+    if "policy_evaluation" in (_metadata(folder) or {}):
+        raise ValueError(
+            f"the agent in {folder} has a critic from policy evaluation (sharpen), which the run "
+            "that would replace the agent does not have; pass replace=True (--replace) to replace "
+            f"it, and sharpen it again afterwards{others}"
         )
 
 
@@ -956,8 +984,8 @@ def train_critic(
             the old critic there. The phase's own state and curve are in a folder in it, which
             stays: a later call with more `steps` goes on from there.
         progress, max_seconds, engine: see `train`. A phase that was stopped is continued.
-        changes: replace fields of the TrainConfig; by default gae_lambda is 0.95, and rollouts
-            have at least 32 steps.
+        changes: replace fields of the TrainConfig; by default gae_lambda is 0.95, rollouts have at
+            least 32 steps, and the inputs are standardized at all scales.
 
     Returns:
         The agent with the new critic and a new state bank. Its metadata are those of the policy's
@@ -965,6 +993,12 @@ def train_critic(
         before its end, `agent` itself, and nothing in the folder is replaced.
     """
     folder = Path(folder) if folder else data_dir() / "checkpoints" / agent.name
+    missing = [name for name in ("config", "scale") if name not in agent.metadata]
+    if missing:
+        raise ValueError(
+            f"the metadata of agent {agent.name!r} lack {missing[0]!r}, which says how its policy "
+            "was trained; restore its agent.json, or train it anew"
+        )
     trained = _from_plain(TrainConfig, agent.metadata["config"])
     base = TrainConfig.at_scale(agent.metadata["scale"], trained.robots[0], name=agent.name)
     length = max(base.rollout_length, 32)
@@ -1047,7 +1081,8 @@ CHANGEABLE = (
     "cut_at_commands",
     "state_bank",
 )
-"""Fields that may change when a run is continued; each change is recorded."""
+"""Fields that may change when a run is continued, and policy.std_limits, the limits of the
+exploration noise; each change is recorded."""
 
 
 def as_continued(config: TrainConfig, folder=None) -> TrainConfig:
@@ -1123,7 +1158,9 @@ def _continued(path: Path, config: TrainConfig, steps: int, robots=()) -> list[d
         ) from error
     now = _plain(config)
     different = [name for name in now if before.get(name) != now[name]]
-    other = [name for name in different if name not in CHANGEABLE]
+    limits = {"std_limits": now["policy"]["std_limits"]}
+    changeable = CHANGEABLE + ("policy",) * (before["policy"] | limits == now["policy"])
+    other = [name for name in different if name not in changeable]
     if other:
         text = "; ".join(_difference(name, before.get(name), now[name]) for name in other)
         raise ValueError(

@@ -60,8 +60,8 @@ class Recording:
 
     @property
     def weighted_terms(self) -> np.ndarray:
-        """float32 [T, 23], what each term adds to the reward before clipping: w_i T_i Δt, times c
-        for all but the first two."""
+        """float32 [T, 23], w_i T_i Δt, times c for all but the first two. The reward of a step is
+        the sum of all but T4, clipped at 0, plus T4's."""
         scale = np.array([term.weight for term in TERMS]) * CONTROL_STEP
         scale[2:] *= self.coefficient
         return (self.terms * scale).astype(np.float32)

@@ -15,6 +15,7 @@ from pathlib import Path
 import mujoco
 import numpy as np
 
+from shapebody.checks import require_kind
 from shapebody.feet import ends_without_foot, foot_ids, lowest, standing_height
 from shapebody.inference import complete
 from shapebody.paths import data_dir
@@ -28,6 +29,12 @@ MIN_MASS, MIN_INERTIA = 1e-7, 1e-11  # kg, kg m²; those of real robots are abov
 MAX_TILT = 45.0  # degrees of the trunk in "home"
 
 _OBJ, _JOINT, _SENSOR = mujoco.mjtObj, mujoco.mjtJoint, mujoco.mjtSensor
+
+
+def require_robot(robot) -> "Robot":
+    """The argument; TypeError if it is no Robot, such as a name."""
+    require_kind("robot", robot, Robot, f"load it with shapebody.load_robot({robot!r})")
+    return robot
 
 
 @dataclass(frozen=True, eq=False)

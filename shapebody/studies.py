@@ -11,6 +11,7 @@ from typing import NamedTuple
 import numpy as np
 
 from shapebody import paper
+from shapebody.checks import require_integer, require_kind
 from shapebody.design import DesignSpace
 from shapebody.evaluation import EvaluationConfig, evaluate, paired_gain
 from shapebody.experiments import (
@@ -101,11 +102,10 @@ def design_study(
     """
     setting = _setting(starts, episodes, horizon, seed, first_start)
     for name, value in setting.items():
-        least = 0 if name in ("seed", "first_start") else 1
-        if not isinstance(value, numbers.Integral) or value < least:
-            raise ValueError(f"{name} is {value!r}; expected an integer of at least {least}")
+        require_integer(name, value, 0 if name in ("seed", "first_start") else 1)
     short = {} if iterations is None else {"iterations": iterations}
     for run in runs:
+        require_kind("a run", run, Run, 'for example studies.Run("vgds", 100.0)')
         _validate(run, short)
     name = _file(robot, first_start)
     setting = _as_stored(name, agent, setting, short)
@@ -378,6 +378,9 @@ def value_against_return(
 
 def published_policy(robot, agent, folder=None, starts: int = 10, episodes: int = 16) -> dict:
     """Returns that the authors' published policy earns in our environment.
+
+    The start designs turn frames and joint axes about our own axes, not about those of the
+    authors' (`DesignSpace(published_axes_of=...)`), so the bodies differ a little from theirs.
 
     Args:
         robot: the robot of that policy.

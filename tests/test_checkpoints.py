@@ -250,6 +250,12 @@ def test_files_that_were_edited(agent, folder):
         for name, data in original.items():
             (folder / name).write_bytes(data)
 
+    description = json.loads(original["agent.json"])
+    (folder / "agent.json").write_text(json.dumps(description | {"states_hash": None}))
+    with pytest.raises(ValueError, match="no state bank, but there is .*states.npz.*restore"):
+        load_agent(folder)
+    restore()
+
     weights = folder / "weights.safetensors"
     weights.write_bytes(original[weights.name][:-4] + np.float32(0.123).tobytes())
     with pytest.raises(ValueError, match="weights.safetensors does not match the hash.*restore"):

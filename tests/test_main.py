@@ -2,13 +2,15 @@
 
 import sys
 from dataclasses import replace
+from pathlib import Path
 
 import pytest
 from tiny import tiny_agent, tiny_robot
 
 from shapebody import ppo
 from shapebody.__main__ import main
-from shapebody.checkpoints import save_agent
+from shapebody.checkpoints import load_agent, save_agent
+from shapebody.robots import load_robot
 
 
 @pytest.fixture(scope="module")
@@ -43,7 +45,37 @@ def test_options_of_training(files, monkeypatch):
     assert calls[0] == given | dict(max_steps=9, state_only=False)
     assert calls[1] == given
     assert calls[2] == dict(max_seconds=None, engine="auto", replace=False)
-    assert calls[3] == dict(max_seconds=7200, engine="mjx")
+    assert calls[3] == dict(max_seconds=7200, engine="mjx", folder=Path(agent))
+
+
+def test_design_looks_at_its_output_before_it_searches(files, monkeypatch, tmp_path, capsys):
+    robot, agent = files
+
+    def never(*arguments, **options):
+        raise AssertionError("searched")
+
+    monkeypatch.setattr(sys.modules["shapebody.search"], "search", never)
+    assert main(["design", robot, "--agent", agent, "--out", robot]) == 1
+    assert "the file of the robot itself" in capsys.readouterr().err
+    assert main(["design", robot, "--agent", agent, "--out", str(tmp_path)]) == 1
+    assert "a folder" in capsys.readouterr().err
+    assert main(["design", robot, "--agent", agent, "--start", "-1"]) == 1
+    assert "start design is -1; expected an integer of at least 0" in capsys.readouterr().err
+
+
+def test_another_file_of_the_robot_is_named(files, tmp_path, capsys):
+    robot, agent = files
+    own = load_agent(agent)
+    phases = [{"robots": {"legs_2": load_robot(robot).hash}}]
+    own = replace(own, metadata=own.metadata | {"phases": phases})
+    folder = str(save_agent(own, tmp_path / "agent"))
+    changed = tmp_path / "legs_2.xml"
+    changed.write_text(Path(robot).read_text() + "\n")
+    options = ["--agent", folder, "--method", "random"]
+    assert main(["design", robot, *options]) == 0
+    assert not capsys.readouterr().err
+    assert main(["design", str(changed), *options]) == 0
+    assert "the file of robot legs_2 is not the one" in capsys.readouterr().err
 
 
 def test_an_interrupt_is_no_traceback(monkeypatch, capsys):

@@ -3,6 +3,7 @@
 import json
 import time
 from dataclasses import replace
+from pathlib import Path
 from types import SimpleNamespace
 
 import jax
@@ -104,6 +105,22 @@ def test_configurations():
 def test_configurations_without_sense(name, value):
     with pytest.raises(ValueError, match=f"{name} is .*; expected"):
         ppo.TrainConfig.reduced("unitree_go2", **{name: value})
+
+
+@pytest.mark.parametrize(
+    "name, value",
+    [("policy", {}), ("critic", None), ("task", None), ("standardize", "yes"), ("seed", 1.5)],
+)
+def test_configurations_of_wrong_kinds(name, value):
+    with pytest.raises((TypeError, ValueError), match=f"{name} is .*; expected"):
+        ppo.TrainConfig.reduced("unitree_go2", **{name: value})
+    with pytest.raises(ValueError, match="scale is 'huge'; expected one of smoke, reduced, full"):
+        ppo.TrainConfig.reduced("unitree_go2", scale="huge")
+
+
+def test_robots_may_be_paths():
+    config = ppo.TrainConfig.reduced(Path("here") / "bolt.xml")
+    assert config.robots == (str(Path("here") / "bolt.xml"),) and config.name == "bolt"
 
 
 @pytest.fixture(scope="module")
@@ -230,6 +247,13 @@ def test_a_call_that_trains_nothing_leaves_the_agent(config, tmp_path, monkeypat
         assert again.hash == load_agent(tmp_path).hash != agent.hash
         assert again.metadata["steps"] == steps and "policy_evaluation" in again.metadata
         assert {file: file.read_bytes() for file in tmp_path.iterdir()} == files
+    # Nor is an agent with such a critic replaced by a call that trains.
+    arguments["max_steps"] = 192
+    save_agent(replace(again, metadata=again.metadata | {"steps": 64}), tmp_path)
+    with pytest.raises(ValueError, match="critic from policy evaluation.*--state-only"):
+        ppo.train(config, **arguments)
+    assert load_agent(tmp_path).hash == again.hash
+    arguments["max_steps"] = 64
     assert ppo.train(config, replace=True, **arguments).hash == load_agent(tmp_path).hash
     assert "policy_evaluation" not in load_agent(tmp_path).metadata
     # An agent that is behind the run is brought up to it.
@@ -272,6 +296,8 @@ def test_a_run_continues_only_with_its_own_configuration(config, tmp_path):
     scaled = replace(config, policy=replace(config.policy, latent_scale=3.0))
     with pytest.raises(ValueError, match=r"policy.latent_scale was 1.0, is 3.0.*as_continued"):
         ppo.Trainer(scaled, tmp_path).start()
+    quiet = replace(config, policy=replace(config.policy, std_limits=(0.05, 2.0)))
+    assert ppo.Trainer(quiet, tmp_path).start()  # the limits of the noise may change
     # The field is named even where the arrays have other shapes.
     wider = replace(config, policy=replace(config.policy, core_widths=(12, 8)))
     with pytest.raises(ValueError, match=r"core_widths was \[16, 8\], is \[12, 8\]"):

@@ -12,6 +12,7 @@ from tiny import quick_compilation, tiny_agent, tiny_robot
 
 from shapebody.descriptions import describe
 from shapebody.design import DesignSpace
+from shapebody.locomotion import Locomotion
 from shapebody.search import Objective, VGDSConfig, search
 from shapebody.search import objective as objectives
 from shapebody.search.vgds import penalty_only, vgds
@@ -146,6 +147,19 @@ def test_penalty_only_ignores_the_critic(agent, robot, starts):
     np.testing.assert_array_equal(one.trajectory, two.trajectory)
     assert not np.allclose(one.history, two.history)
     assert not np.allclose(search("vgds", other, robot, starts, **BATCH).design, one.design)
+
+
+def test_names_and_broken_seeds_are_no_arguments(agent, robot):
+    with pytest.raises(TypeError, match=r"expected a Robot: load it with shapebody.load_robot"):
+        search("vgds", agent, robot.name, DesignSpace(robot).reference)
+    with pytest.raises(ValueError, match="seed is 1.5; expected an integer of at least 0"):
+        search("vgds", agent, robot, DesignSpace(robot).reference, seed=1.5)
+    with pytest.raises(TypeError, match="expected a Robot"):
+        DesignSpace("unitree_go2")
+    with pytest.raises(TypeError, match="expected a Robot"):
+        Locomotion("unitree_go2", num_envs=2)
+    with pytest.raises(ValueError, match="start design is None; expected an integer"):
+        DesignSpace(robot).start(None)
 
 
 @pytest.mark.parametrize("bad", [{"iterations": 0}, {"learning_rate": 0.0}, {"max_update": -1.0}])

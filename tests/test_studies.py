@@ -177,7 +177,7 @@ def test_a_run_that_cannot_be_stops_before_the_first(results, agent, robot, run,
         design_study(agent, robot, (CONTROL, run), **SETTING)
     with pytest.raises(ValueError, match="starts is 0; expected an integer of at least 1"):
         design_study(agent, robot, RUNS, **dict(SETTING, starts=0))
-    with pytest.raises(ValueError, match="iterations is 0; expected an integer from 1 up"):
+    with pytest.raises(ValueError, match="iterations is 0; expected an integer of at least 1"):
         design_study(agent, robot, RUNS, **dict(SETTING, iterations=0))
     assert not results.exists()
 

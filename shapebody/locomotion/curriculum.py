@@ -24,8 +24,8 @@ def is_conclusive(config: TaskConfig, length, terminated):
 def is_success(config: TaskConfig, mean_error, length, command_limit):
     """Whether an episode counts as a success.
 
-    mean_error: mean over time and axes of |v_xy - c_xy|, m/s; length: control steps;
-    command_limit: m/s.
+    mean_error: mean over time and axes of |v_xy - c_xy|, m/s, each term at most twice the command
+    limit; length: control steps; command_limit: m/s.
     """
     accurate = mean_error <= config.curriculum_error * command_limit
     return accurate & (length >= config.curriculum_length)

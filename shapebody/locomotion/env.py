@@ -23,7 +23,7 @@ from shapebody.locomotion.config import TaskConfig
 from shapebody.locomotion.episode import Episode, Outcome
 from shapebody.locomotion.observations import Observation
 from shapebody.locomotion.readings import Readings, reader
-from shapebody.robots import Robot
+from shapebody.robots import Robot, require_robot
 
 RESET_SLOTS = 16
 """Finished environments are restarted in chunks of this size, so that one compiled
@@ -176,7 +176,8 @@ class Locomotion:
         threads: int = 0,
         physics_options: dict | None = None,
     ):
-        robots = [robots] if isinstance(robots, Robot) else list(robots)
+        robots = [robots] if isinstance(robots, Robot | str) else list(robots)
+        robots = [require_robot(robot) for robot in robots]
         if engine not in ("auto", "native", "mjx"):
             raise ValueError(f"engine is {engine!r}; expected 'auto', 'native' or 'mjx'")
         if num_envs < len(robots):

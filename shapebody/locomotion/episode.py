@@ -40,7 +40,8 @@ class Episode:
     ground_time: jax.Array  # [F] s
     air_time: jax.Array  # [F] s
     total_reward: jax.Array  # [] return so far
-    total_error: jax.Array  # [] sum over steps of the mean per-axis |v_xy - c_xy|
+    total_error: jax.Array  # [] sum over steps of the mean per-axis |v_xy - c_xy|,
+    # each at most twice the command limit
 
 
 class Outcome(NamedTuple):

@@ -12,6 +12,8 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
+from shapebody.checks import require_integer
+
 
 class Search(NamedTuple):
     """What a method returns for S starts."""
@@ -144,12 +146,9 @@ def require(config, expected: str, valid: Callable[[float], bool], *names: str) 
 
 
 def require_integers(config, *names: str, least: int = 1) -> None:
-    """ValueError naming the first of the settings `names` that is not an integer from `least`."""
+    """ValueError naming the first setting of `names` that is no integer of at least `least`."""
     for name in names:
-        value = getattr(config, name)
-        integer = isinstance(value, numbers.Integral) and not isinstance(value, bool)
-        if not integer or value < least:
-            raise ValueError(f"{name} is {value!r}; expected an integer from {least} up")
+        require_integer(name, getattr(config, name), least)
 
 
 def require_positive(config, *names: str) -> None:

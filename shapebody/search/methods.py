@@ -24,6 +24,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from shapebody.checkpoints import Agent
+from shapebody.checks import require_integer
 from shapebody.locomotion.observations import Observation
 from shapebody.robots import Robot
 from shapebody.search.bayesian import BOConfig, bo
@@ -127,6 +128,7 @@ def search(
         ImportError: for "bo" without PyTorch and BoTorch.
     """
     function, config = _method(method, settings)
+    require_integer("seed", seed)
     objective = Objective.of(agent, robot, trust_region, reference, states, batch_size)
     starts = objective.values.space.validate(f)
     if starts.ndim > 2 or len(starts) == 0:

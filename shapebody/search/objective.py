@@ -13,11 +13,12 @@ import jax.numpy as jnp
 import numpy as np
 
 from shapebody.checkpoints import Agent
+from shapebody.checks import require_integer
 from shapebody.descriptions import Descriptions, Sizes, describe
 from shapebody.design import DesignSpace
 from shapebody.locomotion.observations import Observation
 from shapebody.networks import Critic, CriticConfig
-from shapebody.robots import Robot
+from shapebody.robots import Robot, require_robot
 
 MAX_ROWS = 8192
 """Most (design, state) pairs that the critic sees at once (a state for every design at least)."""
@@ -112,8 +113,8 @@ class Objective:
                 f"trust_region is {trust_region!r}; expected a finite number of at least 0 "
                 "(the penalty coefficient, 100 in the paper)"
             )
-        if not isinstance(batch_size, numbers.Integral) or batch_size < 1:
-            raise ValueError(f"batch_size is {batch_size!r}; expected an integer of at least 1")
+        require_integer("batch_size", batch_size, 1)
+        require_robot(robot)
         values = design_critic(robot, agent.critic_config)
         space = values.space
         reference = space.reference if reference is None else space.validate(reference)

@@ -1,0 +1,16 @@
+"""Checks of arguments that several modules share."""
+
+import numbers
+
+
+def require_integer(name: str, value, least: int = 0) -> int:
+    """The value as an int; ValueError if it is no integer of at least `least`."""
+    if isinstance(value, bool) or not isinstance(value, numbers.Integral) or value < least:
+        raise ValueError(f"{name} is {value!r}; expected an integer of at least {least}")
+    return int(value)
+
+
+def require_kind(name: str, value, kind: type, hint: str) -> None:
+    """TypeError if the value is no instance of `kind`; `hint` says how to come by one."""
+    if not isinstance(value, kind):
+        raise TypeError(f"{name} is {value!r}; expected a {kind.__name__}: {hint}")
