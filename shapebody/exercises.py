@@ -28,15 +28,42 @@ def _say(right: bool, praise: str, hint: str) -> None:
     print(f"Right. {praise}" if right else f"Not yet. {hint}")
 
 
+def _shown(answer) -> str:
+    """An answer on one line, shortened if it is long."""
+    text = " ".join(repr(answer).split())
+    return text if len(text) <= 80 else f"{text[:77]}..."
+
+
 def _number(answer) -> float | None:
     try:
         value = float(answer)
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         value = np.nan
     if not np.isfinite(value):
-        print(f"Not yet. The answer is {answer!r}; it should be one number.")
+        print(f"Not yet. The answer is {_shown(answer)}; it should be one number.")
         return None
     return value
+
+
+def _numbers(answer, count: int) -> np.ndarray | None:
+    """The answer as `count` finite numbers, None if it is anything else."""
+    try:
+        values = np.array([float(x) for x in answer])
+    except (TypeError, ValueError, OverflowError):
+        return None
+    return values if values.shape == (count,) and np.isfinite(values).all() else None
+
+
+def _array(returned) -> np.ndarray | None:
+    """What a function returned, as an array; says what is wrong if there is none."""
+    if returned is None:
+        print("Not answered yet: the function returns None.")
+        return None
+    try:
+        return np.asarray(returned, float)
+    except (TypeError, ValueError):
+        print(f"Not yet. The function returns {_shown(returned)}; expected an array of numbers.")
+        return None
 
 
 # ------------------------------------------------------------------ 00 quickstart
@@ -52,7 +79,15 @@ def check_trust_regions(results) -> None:
     if not isinstance(results, dict) or set(results) != {0, 20, 100}:
         print("Not yet. Expected a dictionary with the keys 0, 20 and 100.")
         return
+    from shapebody.search import SearchResult
+
     for trust_region, result in results.items():
+        if not isinstance(result, SearchResult):
+            print(
+                f"Not yet. The value under {trust_region} is of type {type(result).__name__}; "
+                "keep the whole result that search returns."
+            )
+            return
         used = result.settings["trust_region"]
         if result.method != "vgds" or used != trust_region:
             print(
@@ -64,12 +99,18 @@ def check_trust_regions(results) -> None:
     if any(not np.array_equal(starts[0], start) for start in starts[1:]):
         print("Not yet. The searches began at different designs; use one start for all three.")
         return
+    first, *others = (result.settings for result in results.values())
+    changed = [key for key in first if any(first[key] != other.get(key) for other in others)]
+    changed = [key for key in changed if key != "trust_region"]
+    if changed:
+        print(f"Not yet. The searches also differ in {', '.join(changed)}; change λ alone.")
+        return
     distance = {key: float(np.sqrt(np.mean(results[key].design ** 2))) for key in (0, 20, 100)}
     listing = ", ".join(f"{value:.3f} at λ = {key}" for key, value in distance.items())
     _say(
         distance[0] >= distance[20] >= distance[100],
         f"The distance |f| / √d from the reference is {listing}: the larger λ, the closer.",
-        f"The distance |f| / √d is {listing}. It should fall with λ; did you pass other settings?",
+        f"The distance |f| / √d is {listing}. It should fall with λ.",
     )
 
 
@@ -130,6 +171,11 @@ def check_heavier(f, space, kilograms: float = 1.0) -> None:
     if _waiting(f, "use the gradient of the total mass at the reference, and a step along it."):
         return
     try:
+        f = np.asarray(f, np.float32)
+    except (TypeError, ValueError):
+        print(f"Not yet. The answer is {_shown(f)}; it should be one design [{space.dim}].")
+        return
+    try:
         f = space.validate(f)
     except ValueError as error:
         print(f"Not yet. {error}")
@@ -172,8 +218,74 @@ def check_reward(function) -> None:
     """
     if not _is_function(function, "write a function (terms, c) and hand the function over."):
         return
-    from shapebody.locomotion.rewards import combine
+    from shapebody.locomotion.config import CONTROL_STEP
+    from shapebody.locomotion.rewards import TERMS, combine
 
+    def compared(terms, c):
+        """The reward that the function gives, None if it is no number, and the right one."""
+        given = _number(function(terms.copy(), c))
+        return given, float(combine(terms.astype(np.float32), c))
+
+    step_hint = "All weights are multiplied by the control step of 0.02 s."
+    c_hint = "T1 and T2 count in full; T3 to T23 are multiplied by c."
+    alive_hint = "T4 is added after the clipping, so that being alive always pays."
+    clip_hint = "The reward is never negative: one part of the sum is clipped at 0."
+    weights = CONTROL_STEP * np.array([term.weight for term in TERMS])
+    calm = np.array([0.5, 0.5, 1, 1, *np.zeros(19)])
+    charged = calm.copy()
+    charged[4] = -1000.0  # so much that the sum is clipped
+    # One term at a time, changed by an amount that its weight makes noticeable while the sum stays
+    # positive. T3 and T4 are 1 in every step, so they are judged by the reward itself. Weights
+    # show at c = 1, the terms that c multiplies below it.
+    varied = [0, 1, *range(4, len(TERMS))]
+    for c in (1.0, 0.4):
+        given, expected = compared(calm, c)
+        if given is None:
+            return
+        counts = np.ones(len(TERMS))  # how often a term counts, 1 if it counts by its weight
+        for i in varied:
+            terms = calm.copy()
+            terms[i] += 0.5 if i < 2 else -0.005 / weights[i]
+            changed, right = compared(terms, c)
+            if changed is None:
+                return
+            counts[i] = (changed - given) / (right - expected)
+        if np.abs(counts - 1).max() < 1e-3:
+            clipped, left = compared(charged, c)
+            if clipped is None:
+                return
+            if clipped < 0:
+                print(f"Not yet. With large penalties the reward is {clipped:.5f}. {clip_hint}")
+                return
+            if abs(given - expected) < 1e-6 and clipped < left - 1e-6:
+                print(
+                    f"Not yet. With large penalties the reward is {left:.5f} at c = {c:g}, not "
+                    f"{clipped:.5f}. {alive_hint}"
+                )
+                return
+            # Of the two terms only T4 counts where the sum is clipped.
+            counts[3] = clipped / left
+            counts[2] = 1 + (given - expected - (clipped - left)) / (c * weights[2])
+        wrong = np.flatnonzero(np.abs(counts - 1) > 1e-3)
+        if len(wrong) == 0:
+            continue
+        names = ", ".join(f"T{i + 1}" for i in wrong)
+        if np.allclose(counts[varied], 1 / CONTROL_STEP, rtol=1e-3):
+            print(f"Not yet. The reward is {1 / CONTROL_STEP:g} times too large. {step_hint}")
+        elif np.allclose(counts[4:], -1, rtol=1e-3):
+            print("Not yet. T5 to T23 are penalties because they are negative; add them.")
+        elif len(wrong) == 1:
+            i = wrong[0]
+            how = "does not count"
+            if abs(counts[i]) > 1e-3:
+                how = f"counts {counts[i]:.4g} times as much as it should"
+            hint = c_hint if c < 1 else "Term k has the weight TERMS[k - 1].weight."
+            print(f"Not yet. At c = {c:g}, {names} ({TERMS[i].name}) {how}. {hint}")
+        elif c < 1:
+            print(f"Not yet. At c = {c:g}, {names} count too much or too little. {c_hint}")
+        else:
+            print(f"Not yet. {names} do not count by their weights, which are in TERMS.")
+        return
     generator = np.random.default_rng(0)
     for trial in range(20):
         terms = np.concatenate(
@@ -182,23 +294,15 @@ def check_reward(function) -> None:
         # The first trials are gentle, so that the clipping does not hide the sum.
         terms[4:] *= 1e-3 if trial < 10 else 1.0
         c = float(generator.uniform(0.05, 1)) if trial % 10 else float(trial // 10)
-        expected = float(combine(terms.astype(np.float32), c))
-        given = _number(function(terms.copy(), c))
+        given, expected = compared(terms, c)
         if given is None:
             return
-        if abs(given - expected) < 1e-4:
+        if abs(given - expected) < 1e-5:
             continue
-        if abs(given * 0.02 - expected) < 1e-4:
-            hint = "All weights are multiplied by the control step of 0.02 s."
-        elif given < 0:
-            hint = "The reward is never negative: one part of the sum is clipped at 0."
-        elif trial >= 10:
-            hint = "T4 is added after the clipping, so that being alive always pays."
-        else:
-            hint = "T1 and T2 count in full; T3 to T23 are multiplied by c."
+        hint = clip_hint if given < 0 else c_hint if trial < 10 else alive_hint
         print(f"Not yet. At c = {c:.2f} the reward is {expected:.5f}, not {given:.5f}. {hint}")
         return
-    _say(True, "The function agrees with the task on 20 random steps.", "")
+    _say(True, "The function agrees with the task term by term and on 20 random steps.", "")
 
 
 def check_successes(answer, levels: int = 100) -> None:
@@ -246,9 +350,8 @@ def check_gae(function) -> None:
     ):
         reward, value = generator.normal(size=(2, steps)).astype(np.float32)
         last = np.float32(generator.normal())
-        given = function(reward.copy(), value.copy(), float(last), discount, gae_lambda)
+        given = _array(function(reward.copy(), value.copy(), float(last), discount, gae_lambda))
         if given is None:
-            print("Not answered yet: the function returns None.")
             return
         never = jnp.zeros((1, steps), bool)
         arguments = (jnp.asarray(x)[None] for x in (reward, value))
@@ -256,7 +359,6 @@ def check_gae(function) -> None:
             *arguments, jnp.asarray(last)[None], never, never, discount, gae_lambda
         )
         expected = np.asarray(expected)[0]
-        given = np.asarray(given, float)
         if given.shape != expected.shape:
             print(f"Not yet. Expected one number per step, {expected.shape}, got {given.shape}.")
             return
@@ -281,17 +383,15 @@ def check_surrogate(function, clip_range: float = 0.1) -> None:
     ratio, advantage = (
         x.ravel() for x in np.meshgrid([0.5, 0.95, 1.0, 1.05, 1.5], [-2.0, -1.0, 0.0, 1.0, 2.0])
     )
-    given = function(ratio.copy(), advantage.copy())
+    given = _array(function(ratio.copy(), advantage.copy()))
     if given is None:
-        print("Not answered yet: the function returns None.")
         return
     clipped = np.clip(ratio, 1 - clip_range, 1 + clip_range)
     expected = np.minimum(ratio * advantage, clipped * advantage)
-    given = np.asarray(given, float)
     if given.shape != expected.shape:
         print(f"Not yet. Expected an array of shape {expected.shape}, got {given.shape}.")
         return
-    wrong = np.flatnonzero(np.abs(given - expected) > 1e-6)
+    wrong = np.flatnonzero(~(np.abs(given - expected) <= 1e-6))  # so that NaN is wrong
     if len(wrong) == 0:
         _say(True, "The gain is never above the unclipped one: a pessimistic estimate.", "")
     elif np.abs(given - clipped * advantage).max() < 1e-6:
@@ -311,24 +411,24 @@ def check_step(function, max_update: float = 0.1) -> None:
     """Exercise: the two clips of eq. (7). function: (f [d], Adam's step [d]) -> next design [d]."""
     if not _is_function(function, "write the function and hand it over."):
         return
-    f = np.array([0.0, 0.0, 0.0, 0.95, -0.95, 0.98, 1.0])
-    step = np.array([0.05, 0.3, -0.3, 0.04, -0.4, -0.5, -0.02])
-    given = function(f.copy(), step.copy())
+    f = np.array([0.0, 0.0, 0.0, 0.95, 0.95, -0.95, 0.98, 1.0, 1.0, -1.0])
+    step = np.array([0.05, 0.3, -0.3, 0.04, 0.3, -0.4, -0.5, -0.02, 0.05, -0.05])
+    given = _array(function(f.copy(), step.copy()))
     if given is None:
-        print("Not answered yet: the function returns None.")
         return
-    given = np.asarray(given, float)
     expected = np.clip(f + np.clip(step, -max_update, max_update), -1, 1)
     if given.shape != expected.shape:
         print(f"Not yet. Expected a design of shape {expected.shape}, got {given.shape}.")
         return
+    wrong = np.flatnonzero(~(np.abs(given - expected) <= 1e-6))  # so that NaN is wrong
+    i = wrong[0] if len(wrong) else 0
     if np.abs(given).max() > 1 + 1e-6:
         hint = "An entry leaves [-1, 1]; the outer clip keeps the design in its box."
     elif np.abs(given - f).max() > max_update + 1e-6:
         hint = f"An entry moves by more than δ_max = {max_update:g}; the inner clip comes first."
     else:
-        hint = f"For f = {f} and steps {step} the next design is {expected}."
-    _say(np.abs(given - expected).max() < 1e-6, "Both clips are in their places.", hint)
+        hint = f"From {f[i]:g} a step of {step[i]:g} leads to {expected[i]:g}, not {given[i]:g}."
+    _say(len(wrong) == 0, "Both clips are in their places.", hint)
 
 
 def check_radius(function, dim: int = 358) -> None:
@@ -368,12 +468,11 @@ def check_growth(answer) -> None:
     segment with a foot add to a design vector; three numbers."""
     if _waiting(answer, "three numbers (a, b, c)."):
         return
-    try:
-        given = tuple(int(x) for x in answer)
-    except (TypeError, ValueError):
-        given = ()
-    if len(given) != 3:
-        print(f"Not yet. The answer is {answer!r}; it should be three whole numbers (a, b, c).")
+    given = _numbers(answer, 3)
+    if given is None or np.any(given % 1):
+        print(
+            f"Not yet. The answer is {_shown(answer)}; it should be three whole numbers (a, b, c)."
+        )
         return
     hints = (
         "(a) A body by itself has 13 parameters, with or without a hinge.",
@@ -387,6 +486,9 @@ def check_growth(answer) -> None:
 def check_per_motor(answer) -> None:
     """Exercise: the name of the shipped robot with the most design parameters per motor."""
     if _waiting(answer, 'the name of a robot, such as "unitree_go2".'):
+        return
+    if not isinstance(answer, str):
+        print(f"Not yet. The answer is {_shown(answer)}; it should be the name of one robot.")
         return
     from shapebody.catalog import robot_table
 
@@ -451,8 +553,11 @@ def check_knee_torque(answer, robot) -> None:
     )
 
 
-def check_twelve_motors(path, motors: int = 12) -> None:
-    """Exercise: a robot file with `motors` motors that validates with nothing left to say."""
+def check_twelve_motors(path) -> None:
+    """Exercise: the notebook's robot with a third hinge and motor in each leg.
+
+    path: a file that validates with nothing left to say.
+    """
     if _waiting(path, "write the file and hand over its path."):
         return
     from shapebody.validation import validate_robot
@@ -462,20 +567,63 @@ def check_twelve_motors(path, motors: int = 12) -> None:
     except TypeError:
         print(f"Not yet. Hand over the path of the file, not {type(path).__name__}.")
         return
-    if not report.ok:
-        print(f"Not yet. {report.problems[0]}")
+    problem = report.problems[0] if report.problems else _lift_problem(report.robot)
+    if problem:
+        print(f"Not yet. {problem}")
         return
-    robot = report.robot
     left = (*report.inferred, *report.warnings)
-    if robot.num_actuators != motors:
-        print(f"Not yet. The robot has {robot.num_actuators} motors instead of {motors}.")
-        return
     _say(
         not left,
-        f"d = {robot.design_dim}: a hinge adds 11 parameters and its motor 3, a further body would "
-        "add 13.",
+        f"d = {report.robot.design_dim}: a hinge adds 11 parameters and its motor 3, a further "
+        "body would add 13.",
         f"The report still says: {left[0]}" if left else "",
     )
+
+
+def _lift_problem(robot) -> str:
+    """What keeps a robot from being the Turtle with a lift in each thigh; empty if nothing does."""
+    import mujoco
+
+    model, data = robot.model, mujoco.MjData(robot.model)
+    bodies = {model.body(i).name: i for i in range(1, model.nbody)}
+    legs = ("FL", "FR", "RL", "RR")
+    turtle = ["trunk", *(f"{leg}_{part}" for leg in legs for part in ("thigh", "shin"))]
+    missing = [name for name in turtle if name not in bodies]
+    if robot.num_actuators != 12:
+        return f"The robot has {robot.num_actuators} motors instead of 12."
+    if len(bodies) != len(turtle):
+        return (
+            f"The robot has {len(bodies)} bodies and the Turtle has {len(turtle)}. Start from the "
+            "Turtle, and put the hinge into the thigh without a new body."
+        )
+    if missing:
+        return f"There is no body {missing[0]!r} in the file. Start from the Turtle."
+    data.qpos[:] = robot.home
+    mujoco.mj_kinematics(model, data)
+    for leg in legs:
+        thigh, shin = (
+            model.body_jntadr[body] + np.arange(model.body_jntnum[body])
+            for body in (bodies[f"{leg}_thigh"], bodies[f"{leg}_shin"])
+        )
+        if (len(thigh), len(shin)) != (2, 1):
+            return (
+                f"{leg}_thigh has {len(thigh)} of the hinges and {leg}_shin {len(shin)}; expected "
+                "2 and 1, the new one in the thigh."
+            )
+        along = np.abs(data.xaxis[thigh] @ data.xaxis[shin[0]]) > 0.999
+        if along.sum() != 1:
+            return (
+                f"{along.sum()} of the two hinges of {leg}_thigh turn about the axis of the knee; "
+                "expected 1, the new one."
+            )
+        lift = int(thigh[np.argmax(along)])
+        low, high = model.jnt_range[lift]
+        if abs(low + 0.6) > 1e-3 or abs(high - 0.6) > 1e-3:
+            return (
+                f"Joint {model.joint(lift).name!r} has the range {low:.3g} to {high:.3g} instead "
+                "of -0.6 to 0.6 rad."
+            )
+    return ""
 
 
 # ------------------------------------------------------------------ 07 trust region
@@ -526,12 +674,9 @@ def check_held_out(answer, gains, trust_regions) -> None:
     """
     if _waiting(answer, "three numbers (λ, mean on the first half, mean on the second half)."):
         return
-    try:
-        given = np.array([float(x) for x in answer])
-    except (TypeError, ValueError):
-        given = np.array([])
-    if given.shape != (3,) or not np.isfinite(given).all():
-        print(f"Not yet. The answer is {answer!r}; it should be three numbers.")
+    given = _numbers(answer, 3)
+    if given is None:
+        print(f"Not yet. The answer is {_shown(answer)}; it should be three numbers.")
         return
     from itertools import combinations
 
@@ -586,6 +731,7 @@ def check_cem_generation(function) -> None:
         (CEMConfig(), 0.4),
         (CEMConfig(particles=10, elite_fraction=0.3), 0.4),
         (CEMConfig(), 0.01),
+        (CEMConfig(minimum_std=0.1), 0.1),
     ):
         designs = np.clip(generator.normal(0.2, spread, (config.particles, 6)), -1, 1)
         scores = generator.normal(size=config.particles)
@@ -629,6 +775,34 @@ def check_climb(propose, update) -> None:
     propose: (config, memory, key) -> designs [P, d] in [-1, 1]; update: (config, memory, scored,
     key) -> next memory. config has particles and std, memory is a NamedTuple of the design [d].
     """
+    for function in (propose, update):
+        if not _is_function(function, "write propose and update and hand both over."):
+            return
+    import jax
+
+    try:
+        left = _climb(propose, update)
+    except _NotYetError as error:
+        print(error)
+    except jax.errors.TracerArrayConversionError:
+        print("Not yet. Compiled code cannot use NumPy on arrays; use jnp instead of np.")
+    except jax.errors.JAXIndexError:
+        print("Not yet. Compiled code cannot pick entries by a mask; use jnp.where or jnp.argmax.")
+    except jax.errors.JAXTypeError:
+        print(
+            "Not yet. Compiled code cannot use if, while, int or float on arrays; use jnp.where "
+            "and other functions of jnp."
+        )
+    else:
+        _say(True, f"It stops within {left:.1%} of the first squared distance to the optimum.", "")
+
+
+class _NotYetError(Exception):
+    """What to tell about an answer; raised where no value can be returned, in compiled code."""
+
+
+def _climb(propose, update) -> float:
+    """Climb a quadratic with two functions; the share of the squared distance that is left."""
     from collections import namedtuple
     from types import SimpleNamespace
 
@@ -638,55 +812,92 @@ def check_climb(propose, update) -> None:
     from shapebody.search.loop import Scored
 
     Memory = namedtuple("Memory", "design")
-    config = SimpleNamespace(particles=16, std=0.1)
+    config = SimpleNamespace(particles=16, std=0.12)
     generator = np.random.default_rng(0)
     optimum = jnp.asarray(generator.uniform(-0.7, 0.7, 10), jnp.float32)
     starts = [np.ones(10, np.float32), generator.uniform(-1, 1, 10).astype(np.float32)]
-    proposer = jax.jit(lambda memory, key: propose(config, memory, key))
-    updater = jax.jit(lambda memory, scored, key: update(config, memory, scored, key))
+
+    def is_array(x):
+        array = isinstance(x, jax.Array | np.ndarray)
+        return array and jnp.issubdtype(x.dtype, jnp.floating)
+
+    @jax.jit
+    def proposer(memory, key):
+        designs = propose(config, memory, key)
+        if designs is None:
+            raise _NotYetError("Not answered yet: propose returns None.")
+        if not is_array(designs):
+            kind = getattr(designs, "dtype", type(designs).__name__)
+            raise _NotYetError(
+                f"Not yet. propose returns {kind}; expected one array of floats. jnp.stack makes "
+                "one of a list of designs."
+            )
+        if designs.shape != (config.particles, 10):
+            raise _NotYetError(
+                f"Not yet. Proposals have shape {designs.shape}; expected one row for each of the "
+                f"{config.particles} particles, ({config.particles}, 10)."
+            )
+        return designs
+
+    @jax.jit
+    def updater(memory, scored, key):
+        changed = update(config, memory, scored, key)
+        if changed is None:
+            raise _NotYetError("Not answered yet: update returns None.")
+        right = isinstance(changed, Memory) and is_array(changed.design)
+        if not right or changed.design.shape != (10,):
+            raise _NotYetError(
+                "Not yet. update has to return memory._replace(design=...), one design."
+            )
+        return changed
+
+    @jax.jit
+    def height(designs):
+        return -jnp.mean((designs - optimum) ** 2, -1)
+
+    inexact = False
     for start in starts:
         memory = Memory(jnp.asarray(start))
         for key in jax.random.split(jax.random.key(0), 150):
-            try:
-                designs = proposer(memory, key)
-                if designs is None:
-                    print("Not answered yet: propose returns None.")
-                    return
-                if designs.shape != (config.particles, 10):
-                    print(
-                        f"Not yet. Proposals have shape {designs.shape}; expected one row for each "
-                        f"of the {config.particles} particles, ({config.particles}, 10)."
-                    )
-                    return
-                values = -jnp.mean((designs - optimum) ** 2, -1)
-                current = -jnp.mean((memory.design - optimum) ** 2)
-                memory = updater(memory, Scored(designs, values, None, current), key)
-            except jax.errors.ConcretizationTypeError:
-                print("Not yet. Compiled code cannot use if or while on arrays; use jnp.where.")
-                return
-            if memory is None:
-                print("Not answered yet: update returns None.")
-                return
-            if not isinstance(memory, Memory) or jnp.shape(memory.design) != (10,):
-                print("Not yet. update has to return memory._replace(design=...), one design.")
-                return
-            if float(jnp.abs(designs).max()) > 1:
-                print("Not yet. A proposal leaves the box [-1, 1]; clip it.")
-                return
-            if float(-jnp.mean((memory.design - optimum) ** 2)) < float(current) - 1e-6:
-                print(
+            designs = proposer(memory, key)
+            values, current = height(designs), height(memory.design)
+            before, memory = memory, updater(memory, Scored(designs, values, None, current), key)
+            if not float(jnp.abs(designs).max()) <= 1:
+                raise _NotYetError("Not yet. A proposal leaves the box [-1, 1]; clip it.")
+            reached, best = float(height(memory.design)), float(values.max())
+            if not reached >= float(current) - 1e-6:
+                raise _NotYetError(
                     "Not yet. The search moved to a worse design. Compare scored.values of the "
                     "best proposal with scored.current."
                 )
-                return
+            target = designs[int(values.argmax())] if best > float(current) else before.design
+            tie = abs(best - float(current)) < 1e-6
+            inexact |= not tie and float(jnp.abs(memory.design - target).max()) > 1e-5
         left = float(jnp.sum((memory.design - optimum) ** 2) / np.sum((start - optimum) ** 2))
         if left > 0.1:
-            print(
+            raise _NotYetError(
                 f"Not yet. After 150 iterations {left:.0%} of the squared distance to the optimum "
                 "remain. Do proposals depend on the key, and does the best of them win?"
             )
-            return
-    _say(True, f"It stops within {left:.1%} of the first squared distance to the optimum.", "")
+    if inexact:
+        raise _NotYetError(
+            "Not yet. The search climbs, but not always to the best proposal, scored.designs at "
+            "jnp.argmax(scored.values)."
+        )
+    middle = Memory(jnp.asarray(starts[1] / 2))
+    keys = jax.random.split(jax.random.key(1), 20)
+    steps = np.stack([proposer(middle, key) for key in keys]) - middle.design
+    if np.array_equal(steps[0], steps[1]):
+        raise _NotYetError("Not yet. The proposals are the same for every key; draw them with it.")
+    # Within a generation, so that a step shared by all particles counts as none.
+    deviation = float(np.sqrt(steps.var(axis=1, ddof=1).mean()))
+    shift = float(np.abs(steps.mean((0, 1))).max())
+    if abs(deviation - config.std) > 0.1 * config.std or shift > 0.4 * config.std:
+        raise _NotYetError(
+            f"Not yet. Among the particles, steps have a deviation of {deviation:.3f} and a mean "
+            f"of up to {shift:.3f}; expected config.std = {config.std:g} and 0."
+        )
+    return left
 
 
 # ------------------------------------------------------------------ 09 design trajectories
@@ -746,7 +957,9 @@ def check_covered(function, trajectory) -> None:
         return int(np.argmax(left <= 0.1 * left[0]))
 
     generator = np.random.default_rng(0)
-    slow = 0.3 + np.outer(0.9 ** np.arange(41), generator.uniform(-0.5, 0.5, 5))
+    # Entries of different speed, so that only the Euclidean distance gives the right number.
+    rates = np.linspace(0.8, 0.95, 5) ** np.arange(41)[:, None]
+    slow = 0.3 + rates * generator.uniform(-0.5, 0.5, 5)
     turns = np.cos(0.4 * np.arange(41)) * 0.93 ** np.arange(41)
     swinging = np.outer(turns, generator.uniform(-0.5, 0.5, 5)) - 0.2
     real = np.asarray(trajectory, float)

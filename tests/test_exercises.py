@@ -1,7 +1,5 @@
 """The checkers accept right answers, and give hints for wrong ones."""
 
-from types import SimpleNamespace
-
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -11,6 +9,7 @@ from shapebody import exercises
 from shapebody.design import DesignSpace
 from shapebody.locomotion.rewards import TERMS
 from shapebody.robots import load_robot
+from shapebody.search import SearchResult
 
 
 @pytest.fixture(scope="module")
@@ -22,11 +21,19 @@ def said(capsys):
     return capsys.readouterr().out.strip()
 
 
-def result(trust_region, distance, start=0.5, method="vgds"):
+def result(trust_region, distance, start=0.5, method="vgds", seed=0):
     trajectory = np.linspace(np.full(4, start), np.full(4, distance), 11).astype(np.float32)
     settings = {"trust_region": float(trust_region), "max_update": 0.1, "learning_rate": 0.05}
-    return SimpleNamespace(
-        trajectory=trajectory, design=trajectory[-1], method=method, settings=settings
+    return SearchResult(
+        design=trajectory[-1],
+        trajectory=trajectory,
+        objective=0.0,
+        history=np.zeros(11, np.float32),
+        evaluations=10,
+        seconds=1.0,
+        compile_seconds=0.0,
+        method=method,
+        settings=settings | {"seed": seed},
     )
 
 
@@ -60,13 +67,21 @@ def test_trust_regions(capsys):
     for answer in wrong:
         exercises.check_trust_regions(answer)
         assert said(capsys).startswith("Not yet")
+    for answer, hint in (
+        (dict.fromkeys((0, 20, 100), 0.4), "of type float"),
+        ({key: one.design for key, one in good.items()}, "of type ndarray"),
+        (good | {100: result(100, 0.1, seed=3)}, "differ in seed"),
+    ):
+        exercises.check_trust_regions(answer)
+        text = said(capsys)
+        assert text.startswith("Not yet") and hint in text, text
 
 
 def test_largest_step(capsys):
     one = result(100, 0.1)
     exercises.check_largest_step(0.04, one)
     assert said(capsys).startswith("Right")
-    for answer in (0.4, 0.05, "much", np.nan):
+    for answer in (0.4, 0.05, "much", np.nan, 10**400, np.ones(3)):
         exercises.check_largest_step(answer, one)
         assert said(capsys).startswith("Not yet")
 
@@ -97,28 +112,83 @@ def test_heavier(space, capsys):
     for answer in (space.reference, long_way, f[:5], 2 + f, np.stack([f, f])):
         exercises.check_heavier(answer, space)
         assert said(capsys).startswith("Not yet")
+    for answer in ("heavy", {"mass": 1.0}, [[0.0], [0.0, 0.0]]):
+        exercises.check_heavier(answer, space)
+        assert "should be one design" in said(capsys)
+
+
+WEIGHTS = np.array([term.weight for term in TERMS]) * 0.02
+
+
+def reward(terms, c, weights=WEIGHTS):
+    weighted = weights * terms
+    inner = weighted[:2].sum() + c * (weighted[2] + weighted[4:].sum())
+    return max(inner, 0) + c * weighted[3]
+
+
+def with_factors(factors):
+    """The reward with the weights of some terms (1 to 23) multiplied by a factor."""
+    weights = WEIGHTS.copy()
+    for term, factor in factors.items():
+        weights[term - 1] *= factor
+    return lambda terms, c: reward(terms, c, weights)
 
 
 def test_reward(capsys):
-    weights = np.array([term.weight for term in TERMS]) * 0.02
-
-    def reward(terms, c):
-        weighted = weights * terms
-        inner = weighted[:2].sum() + c * (weighted[2] + weighted[4:].sum())
-        return max(inner, 0) + c * weighted[3]
-
-    exercises.check_reward(reward)
-    assert said(capsys).startswith("Right")
-    wrong = (
-        lambda terms, c: reward(terms, c) / 0.02,
-        lambda terms, c: weights @ terms,
-        lambda terms, c: max(weights[:2] @ terms[:2] + c * (weights[2:] @ terms[2:]), 0),
-        lambda terms, c: "high",
-        3.0,
-    )
-    for answer in wrong:
+    for answer in (reward, lambda terms, c: jnp.float32(reward(jnp.asarray(terms), c))):
         exercises.check_reward(answer)
-        assert said(capsys).startswith("Not yet")
+        assert said(capsys).startswith("Right")
+    inside = np.append(WEIGHTS[:2], np.zeros(21))
+    wrong = (
+        (lambda terms, c: reward(terms, c) / 0.02, "control step of 0.02 s"),
+        (lambda terms, c: WEIGHTS @ terms, "is clipped at 0"),
+        (
+            lambda terms, c: max(inside @ terms + c * ((WEIGHTS - inside) @ terms), 0),
+            "T4 is added after the clipping",
+        ),
+        (lambda terms, c: inside @ terms + c * ((WEIGHTS - inside) @ terms), "clipped at 0"),
+        (lambda terms, c: c * reward(terms, 1.0), "T1 and T2 count in full"),
+        (lambda terms, c: max(WEIGHTS @ terms - 0.001, 0) + c * 0.001, "T3 to T23 are multiplied"),
+        (with_factors(dict.fromkeys(range(5, 24), -1)), "are negative; add them"),
+        (lambda terms, c: 0.0, "do not count by their weights"),
+        (lambda terms, c: "high", "one number"),
+        (lambda terms, c: terms, "one number"),
+        (3.0, "without calling"),
+    )
+    for answer, hint in wrong:
+        exercises.check_reward(answer)
+        text = said(capsys)
+        assert text.startswith("Not yet") and hint in text, text
+
+
+@pytest.mark.parametrize("term", range(1, 24))
+def test_reward_with_one_wrong_weight(term, capsys):
+    name = f"T{term} ({TERMS[term - 1].name})"
+    # The tracking terms and T4 with a minus make the whole reward wrong, by the clipping.
+    for factor in (0, 1.01, 2) if term < 5 else (0, 1.01, 2, -1):
+        exercises.check_reward(with_factors({term: factor}))
+        text = said(capsys)
+        assert text.startswith(f"Not yet. At c = 1, {name}")
+        assert ("does not count" if factor == 0 else f"{factor:g} times") in text
+
+
+def test_reward_with_several_terms_dropped(capsys):
+    dropped = (6, 7, 12, 13, 14, 15, 17, 18, 21, 22, 23)
+    exercises.check_reward(with_factors(dict.fromkeys(dropped, 0)))
+    assert said(capsys).startswith("Not yet. T6, T7, T12, T13, T14, T15, T17, T18, T21, T22, T23")
+    exercises.check_reward(with_factors({3: 0, 4: 2}))
+    assert said(capsys).startswith("Not yet. T3, T4 do not count")
+
+
+@pytest.mark.parametrize("term", [1, 2, 3, *range(5, 24)])
+def test_reward_with_c_at_a_wrong_place(term, capsys):
+    def answer(terms, c):
+        factor = c if term < 3 else 1 / c if c else 1
+        return with_factors({term: factor})(terms, c)
+
+    exercises.check_reward(answer)
+    text = said(capsys)
+    assert text.startswith(f"Not yet. At c = 0.4, T{term} (") and "multiplied by c" in text
 
 
 def test_successes(capsys):
@@ -145,6 +215,8 @@ def test_gae(capsys):
         lambda *arguments: gae(*arguments, bootstrap=False),
         lambda *arguments: gae(*arguments)[:-1],
         lambda reward, *_: reward,
+        lambda *_: "good",
+        lambda reward, *_: [[0.0], reward],
         1.0,
     )
     for answer in wrong:
@@ -155,7 +227,15 @@ def test_gae(capsys):
 def test_surrogate(capsys):
     exercises.check_surrogate(lambda r, a: np.minimum(r * a, np.clip(r, 0.9, 1.1) * a))
     assert said(capsys).startswith("Right")
-    for answer in (lambda r, a: np.clip(r, 0.9, 1.1) * a, lambda r, a: r * a, lambda r, a: a[0]):
+    wrong = (
+        lambda r, a: np.clip(r, 0.9, 1.1) * a,
+        lambda r, a: r * a,
+        lambda r, a: a[0],
+        lambda r, a: a * np.nan,
+        lambda r, a: "gain",
+        lambda r, a: [r, 0.0],
+    )
+    for answer in wrong:
         exercises.check_surrogate(answer)
         assert said(capsys).startswith("Not yet")
 
@@ -166,8 +246,16 @@ def test_step(capsys):
     wrong = (
         lambda f, step: f + np.clip(step, -0.1, 0.1),
         lambda f, step: np.clip(f + step, -1, 1),
+        lambda f, step: np.maximum(f + np.clip(step, -0.1, 0.1), -1),
+        lambda f, step: np.minimum(f + np.clip(step, -0.1, 0.1), 1),
+        lambda f, step: np.clip(f + np.clip(step, -0.1, 0.1), -1, 5),
+        lambda f, step: np.clip(f + np.minimum(step, 0.1), -1, 1),
+        lambda f, step: np.clip(f + np.maximum(step, -0.1), -1, 1),
         lambda f, step: f,
         lambda f, step: f[0],
+        lambda f, step: f * np.nan,
+        lambda f, step: "next",
+        lambda f, step: [f, 0.0],
     )
     for answer in wrong:
         exercises.check_step(answer)
@@ -205,10 +293,13 @@ def test_growth(capsys):
         (None, "Not answered yet"),
         (3, "three whole numbers"),
         ((13, 24), "three whole numbers"),
+        ((13.9, 24.9, 30.9), "three whole numbers"),
+        ((13, 24, np.inf), "three whole numbers"),
         ((14, 24, 30), "(a)"),
         ((13, 11, 30), "(b)"),
         ((13, 24, 27), "(c)"),
         ((13, 24, 30), "Right"),
+        (np.array([13.0, 24.0, 30.0]), "Right"),
     ]:
         check_growth(answer)
         assert expected in capsys.readouterr().out
@@ -218,6 +309,8 @@ def test_per_motor(capsys):
     for answer, expected in [
         (None, "Not answered yet"),
         ("no_such_robot", "no robot"),
+        (["nao_v5"], "name of one robot"),
+        (load_robot("nao_v5"), "name of one robot"),
         ("unitree_go2", "another robot has more"),
         ("nao_v5", "Right"),
     ]:
@@ -268,8 +361,8 @@ def legged(folder, joints, changes=()):
     legs = motors = ""
     for leg, x, y in (("FL", 1, 1), ("FR", 1, -1), ("RL", -1, 1), ("RR", -1, -1)):
         hinges = "".join(
-            f'\n        <joint name="{leg}_{joint}" axis="{axis}" range="-0.7 0.7"/>'
-            for joint, axis in (("swing", "0 0 1"), ("lift", "0 1 0"))
+            f'\n        <joint name="{leg}_{joint}" axis="{axis}" range="-{limit} {limit}"/>'
+            for joint, axis, limit in (("swing", "0 0 1", 0.7), ("lift", "0 1 0", 0.6))
             if joint in joints
         )
         legs += LEG.format(leg=leg, hinges=hinges, x=0.1 * x, y=0.1 * y, out=0.05 * x)
@@ -315,6 +408,8 @@ def test_twelve_motors(tmp_path, capsys):
         (legged(tmp_path, ("swing", "knee")), "8 motors"),
         (3, "not int"),
         (tmp_path / "none.xml", "does not exist"),
+        ("solo12", "13 bodies and the Turtle has 9"),
+        ("berkeley_humanoid", "13 bodies"),
     ):
         exercises.check_twelve_motors(path)
         text = said(capsys)
@@ -323,10 +418,16 @@ def test_twelve_motors(tmp_path, capsys):
         ((' axis="0 1 0" range="-1 1"', ' axis="0 1 0"'), "has no limits"),
         (('<site name="imu"/>', ""), 'no site "imu"'),
         ((sphere, ""), "no collision spheres"),
+        (("FL_thigh", "FL_upper"), "no body 'FL_thigh'"),
+        (('lift" axis="0 1 0"', 'lift" axis="1 0 0"'), "0 of the two hinges of FL_thigh"),
+        (('swing" axis="0 0 1"', 'swing" axis="0 1 0"'), "2 of the two hinges of FL_thigh"),
+        (('range="-0.6 0.6"', 'range="-0.6 0.7"'), "-0.6 to 0.7 instead"),
+        (('name="FL_lift" axis="0 1 0"', 'name="FL_lift" axis="0 -1 0"'), "Right"),
+        (("_lift", "_third"), "Right"),
     ):
         exercises.check_twelve_motors(legged(tmp_path, joints, [change]))
         text = said(capsys)
-        assert text.startswith("Not yet") and hint in text
+        assert text.startswith("Right" if hint == "Right" else "Not yet") and hint in text, text
 
 
 # 08 VGDS versus baselines
@@ -359,6 +460,8 @@ def test_cem_generation(capsys):
         (lambda designs, scores, config: generation(designs, -scores, config), "the worst ones"),
         (lambda designs, scores, config: (designs.mean(0), designs.std(0)), "best of 32 designs."),
         (other_deviation(lambda elites, floor: elites.std(0)), "below 0.02"),
+        (other_deviation(lambda elites, floor: np.maximum(elites.std(0), 0.02)), "the deviations"),
+        (lambda designs, scores, config: ("mean", "std"), "two arrays"),
         (other_deviation(lambda elites, floor: np.maximum(elites.std(0, ddof=1), floor)), "ddof"),
         (other_deviation(lambda elites, floor: elites.var(0)), "one number per parameter"),
     ):
@@ -426,6 +529,49 @@ def test_climb(capsys):
     def bare(config, memory, scored, key):
         return scored.designs[0]
 
+    def listed(config, memory, key):
+        return list(climb_propose(config, memory, key))
+
+    def with_numpy(config, memory, key):
+        return np.minimum(climb_propose(config, memory, key), 1)
+
+    def whole(config, memory, key):
+        return jnp.zeros((config.particles, len(memory.design)), int)
+
+    def undefined(config, memory, key):
+        return climb_propose(config, memory, key) * jnp.nan
+
+    def narrow(config, memory, key):
+        noise = jax.random.normal(key, (config.particles, len(memory.design)))
+        return jnp.clip(memory.design + 0.1 * noise, -1, 1)
+
+    def unison(config, memory, key):
+        step = config.std * jax.random.normal(key, memory.design.shape)
+        signs = jnp.where(jnp.arange(config.particles) < 15, 1.0, -1.0)
+        return jnp.clip(memory.design + signs[:, None] * step, -1, 1)
+
+    def repeated(config, memory, key):
+        return climb_propose(config, memory, jax.random.key(3))
+
+    def integer(config, memory, scored, key):
+        return memory._replace(design=scored.designs[int(scored.values.argmax())])
+
+    def masked(config, memory, scored, key):
+        return memory._replace(design=scored.designs[scored.values > scored.current][0])
+
+    def numpy_update(config, memory, scored, key):
+        best = jnp.argmax(scored.values)
+        design = np.where(scored.values[best] > scored.current, scored.designs[best], memory.design)
+        return memory._replace(design=design)
+
+    def first_better(config, memory, scored, key):
+        first = jnp.argmax(scored.values > scored.current)
+        better = scored.values[first] > scored.current
+        return memory._replace(design=jnp.where(better, scored.designs[first], memory.design))
+
+    def lost(config, memory, scored, key):
+        return memory._replace(design=memory.design * jnp.nan)
+
     for propose, update, hint in (
         (unclipped, climb_update, "leaves the box"),
         (single, climb_update, "expected one row"),
@@ -433,10 +579,28 @@ def test_climb(capsys):
         (climb_propose, careless, "worse design"),
         (climb_propose, branching, "jnp.where"),
         (climb_propose, bare, "_replace"),
+        (listed, climb_update, "returns list; expected one array"),
+        (lambda *_: "designs", climb_update, "returns str; expected one array"),
+        (lambda *_: np.array(["a"]), climb_update, "one array of floats"),
+        (whole, climb_update, "returns int32; expected one array of floats"),
+        (with_numpy, climb_update, "jnp instead of np"),
+        (undefined, climb_update, "leaves the box"),
+        (narrow, climb_update, "expected config.std"),
+        (unison, climb_update, "Not yet"),
+        (repeated, climb_update, "key"),
+        (climb_propose, integer, "int or float"),
+        (climb_propose, masked, "by a mask"),
+        (climb_propose, numpy_update, "jnp instead of np"),
+        (climb_propose, first_better, "not always to the best"),
+        (climb_propose, lost, "worse design"),
+        (climb_propose, lambda *_: "memory", "_replace"),
+        (climb_propose, 3, "without calling"),
     ):
         check(propose, update)
         text = said(capsys)
         assert text.startswith("Not yet") and hint in text, text
+    check(None, None)
+    assert said(capsys).startswith("Not answered yet")
 
 
 def test_penalty_coefficient(capsys):
@@ -535,6 +699,10 @@ def test_covered(capsys):
         far = np.linalg.norm(path, axis=1)
         return np.argmax(far <= 0.1 * far[0])
 
+    def largest_entry(path):
+        far = np.abs(path - path[-1]).max(1)
+        return np.argmax(far <= 0.1 * far[0])
+
     check = exercises.check_covered
     check(None, search)
     check(lambda path: None, search)
@@ -546,6 +714,7 @@ def test_covered(capsys):
         "length of the path": along,
         "reference": to_reference,
         "row n is iteration n": lambda path: right(path) + 1,
+        "Here it is iteration": largest_entry,
         "first time": settled,
         "one number": lambda path: "soon",
         "without calling": 7,
