@@ -145,6 +145,9 @@ def _sharpen(options):
     )
     if sharper is agent:
         print("not finished: the agent is as it was, the same command continues")
+    else:
+        steps = sharper.metadata["policy_evaluation"]["steps"]
+        print(f"agent {sharper.name}: a critic of {steps:,} steps of policy evaluation")
 
 
 def _design(options):

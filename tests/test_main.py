@@ -35,7 +35,12 @@ def test_options_of_training(files, monkeypatch):
     calls = []
     monkeypatch.setattr(ppo, "train", lambda config, **given: calls.append(given))
     monkeypatch.setattr(ppo, "anneal", lambda name, steps, **given: calls.append(given))
-    monkeypatch.setattr(ppo, "train_critic", lambda *unnamed, **given: calls.append(given))
+
+    def train_critic(agent, *unnamed, **given):
+        calls.append(given)
+        return agent
+
+    monkeypatch.setattr(ppo, "train_critic", train_critic)
     options = ["--engine", "mjx", "--hours", "2"]
     assert main(["train", robot, "--replace", "--steps", "9", *options]) == 0
     assert main(["anneal", "any", "--replace", *options]) == 0
