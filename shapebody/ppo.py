@@ -81,7 +81,8 @@ class TrainConfig:
     """Control steps per environment and iteration."""
     total_steps: int = 1_000_000_000
     minibatch_size: int = 16_384
-    """Control steps per gradient step: whole environments times the rollout length."""
+    """Control steps per gradient step: whole environments times the rollout length. If it does not
+    divide the batch (15,040 environments), every epoch leaves out some environments at random."""
     epochs: int = 10
     learning_rate: tuple[float, float] = (1.5e-3, 3e-4)
     """At the first and at the last step; linear between."""
@@ -158,10 +159,10 @@ class TrainConfig:
             )
         object.__setattr__(self, "learning_rate", rates)
         batch = self.num_envs * self.rollout_length
-        if self.minibatch_size % self.rollout_length or batch % self.minibatch_size:
+        if self.minibatch_size % self.rollout_length or self.minibatch_size > batch:
             raise ValueError(
                 f"minibatch_size is {self.minibatch_size}; it must be a multiple of "
-                f"rollout_length ({self.rollout_length}) and divide num_envs x rollout_length "
+                f"rollout_length ({self.rollout_length}) and at most num_envs x rollout_length "
                 f"({batch})"
             )
 
@@ -473,6 +474,7 @@ def make_update(config: TrainConfig, policy: Policy, critic: Critic):
         orders = jax.vmap(lambda k: jax.random.permutation(k, config.num_envs))(
             jax.random.split(key, config.epochs)
         )
+        orders = orders[:, : minibatches * envs_per_minibatch]
         rows = orders.reshape(config.epochs * minibatches, envs_per_minibatch)
         (learner, _), metrics = jax.lax.scan(one, (learner, jnp.asarray(False)), rows)
         updates = jnp.maximum(jnp.sum(metrics["updates"]), 1.0)

@@ -9,6 +9,7 @@ from types import SimpleNamespace
 import jax
 import jax.numpy as jnp
 import numpy as np
+import optax
 import pytest
 
 from shapebody import ppo
@@ -62,8 +63,11 @@ def test_configurations():
     assert (full.entropy_coefficient, full.max_gradient_norm) == (0.005, 3.0)
     assert full.kl_threshold == 0.5 and full.total_steps == 10**9
     assert full.value_lambda is None and not full.cut_at_commands  # as the paper has it
-    with pytest.raises(ValueError, match="minibatch_size is 1000"):
-        replace(full, minibatch_size=1000)
+    for size in (1000, 2 * full.batch):
+        with pytest.raises(ValueError, match=f"minibatch_size is {size}"):
+            replace(full, minibatch_size=size)
+    for environments in (7_680, 15_040):  # the paper's other runs
+        assert replace(full, num_envs=environments).minibatch_size == 16_384
     with pytest.raises(ValueError, match="scale is 'huge'"):
         ppo.TrainConfig.at_scale("huge", "unitree_go2")
 
@@ -356,6 +360,15 @@ def test_annealing_leaves_the_run_as_it_is(config, tmp_path, monkeypatch):
     arguments |= {"steps": 2 * config.batch, "replace": True}
     assert ppo.anneal("walker", max_seconds=0.0, **arguments) is None
     assert (tmp_path / "annealed" / "training.safetensors").exists()
+
+
+def test_environments_that_fill_no_minibatch_wait_for_another_epoch(config, tmp_path):
+    config = replace(config, num_envs=10, minibatch_size=32, epochs=3)  # 4 environments in each
+    trainer = ppo.Trainer(config, tmp_path)
+    trainer.start()
+    trainer.run(max_steps=config.batch, progress=False)
+    counts = optax.tree.get_all_with_path(trainer.learner.policy_optimizer, "count")
+    assert [int(count) for _, count in counts] == [3 * 2]
 
 
 def test_state_only_saves_no_agent(config, tmp_path):
