@@ -38,7 +38,7 @@ def main(arguments=None) -> int:
         "sharpen", help="policy evaluation: a new critic for an agent's frozen policy"
     )
     sharpen.add_argument("agent")
-    sharpen.add_argument("--steps", type=int, help="3 %% of those of training if not given")
+    sharpen.add_argument("--steps", type=int, help="12 %% of those of training if not given")
     sharpen.add_argument("--hours", type=float, help="stop after this time; run again to continue")
 
     design = commands.add_parser("design", help="search for a better body")

@@ -161,18 +161,24 @@ def agents_table(agents: Iterable):
 
     rows = []
     for agent in agents:
-        sharpened = agent.metadata.get("policy_evaluation")
         rows.append(
             (
                 agent.name,
                 f"{agent.metadata['steps'] / 1e6:.1f} million",
                 float(load_curve(agent.name)["coefficient"][-1]),
-                f"{sharpened['steps'] / 1e6:.1f} million" if sharpened else None,
+                _policy_evaluation(agent.metadata.get("policy_evaluation")),
                 f"{agent.critic_config.latent_scale:g}",
             )
         )
     header = ("agent", "training steps", "c at their end", "policy evaluation", "latent scale")
     return table(rows, header)
+
+
+def _policy_evaluation(phase) -> str | None:
+    if phase is None:
+        return None
+    actions = "mean" if phase["config"].get("mean_actions") else "noisy"
+    return f"{phase['steps'] / 1e6:.1f} million, {actions} actions"
 
 
 def _text(value, digits) -> str:

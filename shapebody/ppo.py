@@ -104,6 +104,8 @@ class TrainConfig:
     task: TaskConfig = field(default_factory=TaskConfig)
     learn_policy: bool = True
     """False in the policy-evaluation phase: only the critic learns, at c = 1."""
+    mean_actions: bool = False
+    """Act without exploration noise, as in evaluation; only if the policy does not learn."""
     state_bank: int = 2048
     """States kept for design search."""
 
@@ -136,8 +138,13 @@ class TrainConfig:
             hint = f"shapebody.{kind.__name__}.reduced(...)"
             require_kind(name, getattr(self, name), kind, hint)
         require_kind("task", self.task, TaskConfig, "shapebody.TaskConfig(...)")
-        for name in ("standardize", "cut_at_commands", "learn_policy"):
+        for name in ("standardize", "cut_at_commands", "learn_policy", "mean_actions"):
             require_kind(name, getattr(self, name), bool, "True or False")
+        if self.learn_policy and self.mean_actions:
+            raise ValueError(
+                "mean_actions is True, but a policy learns from its exploration; expected "
+                "learn_policy=False with it"
+            )
         if self.scale not in SCALES:
             raise ValueError(f"scale is {self.scale!r}; expected one of {', '.join(SCALES)}")
         if not _is_number(self.entropy_coefficient, math.inf):
@@ -298,12 +305,13 @@ def command_changes(observation: Observation, last_observation: Observation):
     return jnp.any(following != commands, -1)
 
 
-def make_policy_function(policy: Policy):
-    """The stochastic policy as `Locomotion.rollout` wants it; extra is the log density."""
+def make_policy_function(policy: Policy, mean_actions: bool = False):
+    """The policy as `Locomotion.rollout` wants it; extra is the log density of the action."""
 
     def act(variables, key, descriptions, observation):
         mean, std = policy.apply(variables, descriptions, observation)
-        action = mean + std * jax.random.normal(key, mean.shape) * descriptions.joint_mask
+        noise = 0.0 if mean_actions else jax.random.normal(key, mean.shape)
+        action = mean + std * noise * descriptions.joint_mask
         return action, log_prob(mean, std, action, descriptions.joint_mask)
 
     return act
@@ -547,7 +555,7 @@ class Trainer:
         self.env = Locomotion(robots, config.num_envs, engine=engine, config=task)
         self.policy, self.critic = Policy(config.policy), Critic(config.critic)
         self.update, start = make_update(config, self.policy, self.critic)
-        self.act = make_policy_function(self.policy)
+        self.act = make_policy_function(self.policy, config.mean_actions)
         keys = jax.random.split(jax.random.PRNGKey(config.seed), 4)
         self.key = keys[0]
         constants = self._constants(keys[1]) if config.standardize else None
@@ -971,23 +979,26 @@ def train_critic(
 ) -> Agent:
     """Policy evaluation: train a new critic for a frozen policy, at all distances from f = 0.
 
-    The agent's policy acts (with its exploration noise) on designs f ~ U([-r, r]^d) with
-    r ~ U(0, 1); the critic learns its TD(lambda) returns. An episode lasts 200 control steps at
-    most, since what a critic has to learn here is the design: it sees more of them than with whole
-    episodes, and the value of what follows is bootstrapped. The new state bank comes from such
-    designs and episodes too, at all distances from f = 0 instead of over the full design space.
+    The agent's policy acts on designs f ~ U([-r, r]^d) with r ~ U(0, 1), with its mean actions as
+    in evaluation: with exploration noise, the critic would learn which bodies bear that noise. It
+    learns TD(lambda) returns, using each step once, so that more time goes into new bodies. An
+    episode lasts 200 control steps at most, since what a critic has to learn here is the design:
+    it sees more of them than with whole episodes, and the value of what follows is bootstrapped.
+    The new state bank comes from such designs and episodes too, at all distances from f = 0
+    instead of over the full design space.
 
     Args:
         agent: its policy is kept, its critic and state bank are replaced.
         critic: sizes of the new critic.
-        steps: environment steps; 3 % of those that training takes at the agent's scale if not
-            given, 1.5 million at `reduced`.
+        steps: environment steps; 12 % of those that training takes at the agent's scale if not
+            given, 6 million at `reduced`.
         folder: where the new agent is saved; data/checkpoints/<agent> by default, which replaces
             the old critic there. The phase's own state and curve are in a folder in it, which
             stays: a later call with more `steps` goes on from there.
         progress, max_seconds, engine: see `train`. A phase that was stopped is continued.
-        changes: replace fields of the TrainConfig; by default gae_lambda is 0.95, rollouts have at
-            least 32 steps, and the inputs are standardized at all scales.
+        changes: replace fields of the TrainConfig; by default gae_lambda is 0.95, epochs is 1,
+            mean_actions is True, rollouts have at least 32 steps, and the inputs are standardized
+            at all scales.
 
     Returns:
         The agent with the new critic and a new state bank. Its metadata are those of the policy's
@@ -1014,13 +1025,15 @@ def train_critic(
             "critic": critic,
             "standardize": True,
             "learn_policy": False,
+            "mean_actions": True,
+            "epochs": 1,
             "discount": trained.discount,
             "gae_lambda": 0.95,
             "value_lambda": None,
             # Returns with that λ look further ahead than short rollouts reach.
             "num_envs": base.batch // length,
             "rollout_length": length,
-            "total_steps": base.total_steps * 3 // 100 if steps is None else steps,
+            "total_steps": base.total_steps * 12 // 100 if steps is None else steps,
             "task": replace(trained.task, horizon=200, design_radius=(0.0, 1.0)),
             **changes,
         },

@@ -40,6 +40,7 @@ def test_agents_table():
     first, second = plots.agents_table(agents).rows
     assert first[0] == "unitree_go2" and first[1].endswith(" million")
     assert 0 < float(second[2]) <= 1
+    assert "million, " in second[3] and second[3].endswith(" actions")
 
 
 def test_missing_column_is_named(curve):

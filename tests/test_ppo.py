@@ -66,6 +66,8 @@ def test_configurations():
     for size in (1000, 2 * full.batch):
         with pytest.raises(ValueError, match=f"minibatch_size is {size}"):
             replace(full, minibatch_size=size)
+    with pytest.raises(ValueError, match="mean_actions is True, but a policy learns"):
+        replace(full, mean_actions=True)
     for environments in (7_680, 15_040):  # the paper's other runs
         assert replace(full, num_envs=environments).minibatch_size == 16_384
     with pytest.raises(ValueError, match="scale is 'huge'"):
@@ -560,7 +562,21 @@ def test_train_and_policy_evaluation(config, tmp_path):
     assert phase["steps"] == 256
     assert phase["config"]["task"]["design_radius"] == [0.0, 1.0]
     assert phase["config"]["task"]["horizon"] == 200
+    assert phase["config"]["mean_actions"] and phase["config"]["epochs"] == 1
     assert np.all(np.asarray(sharper.states.privileged)[:, 4] == 1.0)
+
+
+def test_mean_actions_are_without_noise(config, tmp_path):
+    """The first ones of a rollout do not depend on its random key."""
+    config = replace(config, learn_policy=False)
+    for mean_actions in (True, False):
+        trainer = ppo.Trainer(replace(config, mean_actions=mean_actions), tmp_path)
+        first = []
+        for key in jax.random.split(trainer.key):
+            state = trainer.env.reset(trainer.key, coefficient=1.0)
+            arguments = trainer.act, trainer.learner.policy, state, key, config.rollout_length
+            first.append(np.asarray(trainer.env.rollout(*arguments)[1].action)[0])
+        assert np.all((first[0] == first[1]) == mean_actions)
 
 
 def test_the_time_left_is_that_of_the_call(capsys):
