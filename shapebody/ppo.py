@@ -980,7 +980,7 @@ def train_critic(
     """Policy evaluation: train a new critic for a frozen policy, at all distances from f = 0.
 
     The agent's policy acts on designs f ~ U([-r, r]^d) with r ~ U(0, 1), with its mean actions as
-    in evaluation: with exploration noise, the critic would learn which bodies bear that noise. It
+    in evaluation: with exploration noise, the critic learns which bodies bear that noise, too. It
     learns TD(lambda) returns, using each step once, so that more time goes into new bodies. An
     episode lasts 200 control steps at most, since what a critic has to learn here is the design:
     it sees more of them than with whole episodes, and the value of what follows is bootstrapped.
