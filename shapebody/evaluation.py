@@ -242,7 +242,7 @@ def _queued(env: Locomotion, agent: Agent, work: _Work) -> _Episodes:
     running = np.ones(env.num_envs, bool)
     step = 0
     while running.any():
-        state, record, _ = env.step(policy, params, state, key)
+        state, record, _ = env.step(policy, params, state, key, running)
         ended = running & (record.terminated | record.truncated)
         _store(results, number[ended], record, ended)
         running &= ~ended

@@ -218,6 +218,21 @@ def test_designs_of_some_simulations(native, robot, embodiments, controls):
                 np.testing.assert_array_equal(getattr(before[i], name), expected)
 
 
+def test_only_running_simulations_move(native, robot, embodiments, controls):
+    alone = start(NativePhysics(robot, N, threads=2, **SOLVER), embodiments)
+    running = np.arange(N) % 3 == 0
+    native.step(controls[0]), alone.step(controls[0])
+    before = native.state()
+    for ctrl in controls[1:5]:
+        expected = copies(alone.step(ctrl))
+        readings = copies(native.step(ctrl, running=running))
+        for one, two in zip(readings, expected, strict=True):
+            np.testing.assert_array_equal(one[running], two[running])
+    for name in ("qpos", "qvel", "time"):
+        np.testing.assert_array_equal(native.state()[name][~running], before[name][~running])
+    assert readings[-1].all()
+
+
 def test_mjx_reset(mjx_physics, embodiments, controls, robot):
     physics, step = mjx_physics
     state = physics.init(embodiments, robot.home, np.zeros(robot.model.nv))
@@ -387,6 +402,10 @@ def test_solver_options(robot):
         ),
         (lambda p, e: p.step(np.zeros((N, 11))), r"ctrl has shape \(8, 11\)"),
         (lambda p, e: p.step(np.zeros((N, 12)), qvel=np.zeros(18)), "qvel has shape"),
+        (
+            lambda p, e: p.step(np.ones((N, 12)), running=np.ones(3, bool)),
+            r"running has shape \(3,\)",
+        ),
         (lambda p, e: p.restore({"qpos": p.qpos}), "lacks qvel"),
         (lambda p, e: p.restore(p.state() | {"time": np.zeros(3)}), "time has shape"),
         (lambda p, e: p.get_model(N), "0 to 7"),

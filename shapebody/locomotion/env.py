@@ -451,8 +451,12 @@ class Locomotion:
         stacked = jax.tree.map(lambda *x: np.stack(x), *records)
         return state, self._trajectory(stacked, first, state)
 
-    def step(self, policy: Policy, params, state: Episode, key):
-        """One control step with the native engine: (state, StepRecord of numpy arrays, Outcome)."""
+    def step(self, policy: Policy, params, state: Episode, key, running=None):
+        """One control step with the native engine: (state, StepRecord of numpy arrays, Outcome).
+
+        Where `running` ([N] bool, all if None) is False the body is not simulated, which saves
+        time, and what is returned about that environment means nothing.
+        """
         act = self._compiled(policy)
         moved, targets, observation, action, extra = act(params, state, key)
         target, trunk, velocity = map(np.asarray, targets)
@@ -463,7 +467,9 @@ class Locomotion:
             physics, s, nu = group.physics, group.slice, group.robot.num_actuators
             physics.qvel[:, :6] = trunk[s]
             physics.qvel[:, group.qvel_index] = velocity[s, :nu]
-            qpos, qvel, sensordata, finite = physics.step(target[s, :nu])
+            qpos, qvel, sensordata, finite = physics.step(
+                target[s, :nu], running=None if running is None else running[s]
+            )
             raw.append((_f32(qpos), _f32(qvel), _f32(sensordata), np.array(finite)))
         state, outcome, following = self._account(state, tuple(raw))
         state = replace(state, design=design, descriptions=descriptions)

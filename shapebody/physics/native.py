@@ -136,6 +136,7 @@ class NativePhysics:
         ctrl: np.ndarray,
         qpos: np.ndarray | None = None,
         qvel: np.ndarray | None = None,
+        running: np.ndarray | None = None,
     ) -> Readings:
         """Advance every simulation by one control step.
 
@@ -143,6 +144,8 @@ class NativePhysics:
           ctrl: (N, nu) target positions of the actuators in radians, held for all substeps.
           qpos: (N, nq) positions to start from instead of the present ones, or None.
           qvel: (N, nv) velocities to start from instead of the present ones, or None.
+          running: (N,) bool, the simulations to advance; the others stay where they are, which
+            costs nothing. None advances all.
 
         Returns:
           Readings. `qpos`, `qvel` and `sensordata` are the live arrays, so copy what must survive
@@ -151,6 +154,13 @@ class NativePhysics:
         Raises:
           ValueError: arrays of other shapes.
         """
+        ids = None  # all
+        if running is not None:
+            if np.shape(running) != (self.num_envs,):
+                raise ValueError(
+                    f"running has shape {np.shape(running)}; expected ({self.num_envs},)"
+                )
+            ids = np.flatnonzero(running)
         self._write("ctrl", self._ctrl, ctrl)
         if qpos is not None:
             self._write("qpos", self.qpos, qpos)
@@ -160,7 +170,7 @@ class NativePhysics:
         finite = self._valid()
         with _silent_log():
             try:
-                self._batch.step(nstep=self.substeps)
+                self._batch.step(ids=ids, nstep=self.substeps)
             except SimulationError as error:
                 finite[error.ids] = False
         sensordata = self._sensordata
