@@ -233,6 +233,18 @@ def test_only_running_simulations_move(native, robot, embodiments, controls):
     assert readings[-1].all()
 
 
+@pytest.mark.parametrize("value", [1e39, np.nan])
+def test_sensor_values_beyond_single_precision_are_failures(
+    native, robot, controls, value, monkeypatch
+):
+    sensordata = np.array(native.step(controls[0]).sensordata)
+    sensordata[3, -1] = value
+    monkeypatch.setattr(native, "_sensordata", sensordata)
+    readings = native.step(controls[1], running=np.zeros(N, bool))
+    np.testing.assert_array_equal(np.flatnonzero(~readings.finite), [3])
+    np.testing.assert_array_equal(readings.sensordata[3], home_sensordata(robot, prepare(robot)))
+
+
 def test_mjx_reset(mjx_physics, embodiments, controls, robot):
     physics, step = mjx_physics
     state = physics.init(embodiments, robot.home, np.zeros(robot.model.nv))

@@ -24,6 +24,7 @@ _FATAL_WARNINGS = slice(
     int(mujoco.mjtWarning.mjWARN_BADQPOS), int(mujoco.mjtWarning.mjWARN_BADCTRL) + 1
 )
 _STATE = ("qpos", "qvel", "qacc_warmstart", "time")
+_LARGEST = float(np.finfo(np.float32).max)  # sensor values are handed on in single precision
 
 
 class NativePhysics:
@@ -34,10 +35,11 @@ class NativePhysics:
     design, at rest in the home pose.
 
     A simulation fails when MuJoCo raises an error in it, when a position, velocity or
-    acceleration is not finite or exceeds 1e10, or when its control is invalid. It is then
-    reported, put at rest in the home pose, and may go on from there; no other simulation notices.
-    MuJoCo prints nothing about it: its log, to the console and to MUJOCO_LOG.TXT, is off while a
-    step runs (for the whole process, since MuJoCo has only one log) and is restored after it.
+    acceleration is not finite or exceeds 1e10, when a sensor value exceeds single precision, or
+    when its control is invalid. It is then reported, put at rest in the home pose, and may go on
+    from there; no other simulation notices. MuJoCo prints nothing about it: its log, to the
+    console and to MUJOCO_LOG.TXT, is off while a step runs (for the whole process, since MuJoCo
+    has only one log) and is restored after it.
 
     One instance must not be used from two Python threads at once; several instances may.
 
@@ -174,7 +176,8 @@ class NativePhysics:
             except SimulationError as error:
                 finite[error.ids] = False
         sensordata = self._sensordata
-        finite &= self._valid() & ~self._warnings.any(1) & np.isfinite(sensordata).all(1)
+        finite &= self._valid() & ~self._warnings.any(1)
+        finite &= (np.abs(sensordata) <= _LARGEST).all(1)  # also False for NaN
         if not finite.all():
             failed = np.flatnonzero(~finite)
             self.set_state(failed, self.robot.home, np.zeros(self.model.nv))
