@@ -75,7 +75,8 @@ __all__ = [
 FORMAT = 1
 WEIGHTS, DESCRIPTION, STATES, CURVE = "weights.safetensors", "agent.json", "states.npz", "curve.csv"
 _CONFIGURATION = ("robots", "sizes", "policy_config", "critic_config")
-_PACKAGES = ("shapebody", "jax", "flax", "optax", "mujoco", "numpy")
+_PACKAGES = ("shapebody", "jax", "flax", "optax", "mujoco", "numpy", "cma")
+_EXTRA_PACKAGES = ("torch", "gpytorch", "botorch")  # of the extra `bo`
 
 
 @dataclass(frozen=True, eq=False)
@@ -165,14 +166,16 @@ def provenance() -> dict:
     """Versions, commit and machine of this process, for results and agents.
 
     `commit` is that of the checkout which holds the package, with "+" if tracked files differ from
-    it; None outside a git checkout or without git.
+    it; None outside a git checkout or without git. It is read once, by the first call: long work
+    makes that call before it begins, so that a later commit is not taken for the code that runs.
     """
     versions = {"python": platform.python_version()}
-    for package in _PACKAGES:
+    for package in (*_PACKAGES, *_EXTRA_PACKAGES):
         try:
             versions[package] = importlib.metadata.version(package)
         except importlib.metadata.PackageNotFoundError:
-            versions[package] = "not installed"
+            if package in _PACKAGES:
+                versions[package] = "not installed"
     device = jax.devices()[0]
     return {
         "versions": versions,
@@ -186,6 +189,7 @@ def provenance() -> dict:
     }
 
 
+@functools.lru_cache
 def _commit() -> str | None:
     folder = Path(__file__).resolve().parent
 

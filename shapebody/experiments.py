@@ -128,33 +128,43 @@ def result_in_parts(
     agent=None,
     recompute: bool = False,
     progress: bool = False,
+    settings: dict[str, dict] | None = None,
     **config,
 ):
     """`result` for long computations: each part is stored as soon as it is done.
 
     A computation that was interrupted goes on with the first part that is missing. The file may
     hold more parts than are asked for. A file of another agent or of other settings is not
-    overwritten: it is renamed to <name>.old.json.
+    overwritten: it is renamed to <name>.old.json. So is one in which a part has other settings of
+    its own; the rest of it is used.
 
     Args:
         name, agent, config: see `result`.
         recompute: compute these parts anew; others in the file stay.
         parts: by name, functions that return the records of one part.
         progress: print a line per part that is computed.
+        settings: by name of the part, what this part alone depends on.
 
     Returns:
         {"records": those of `parts`, in that order, "provenance": {...}}; "seconds" there is the
         sum over these parts.
     """
     path, kept = result_path(name), scale() != "smoke"
+    settings = settings or {}
     known = _known_parts(path, agent, config, recompute) if kept else {}
-    another = kept and not known and path.exists()
+    fitting = {part: known[part] for part in known if _fits(known[part], settings.get(part))}
+    another = kept and path.exists() and (not known or len(fitting) < len(known))
+    known = fitting
+    if recompute or parts.keys() - known.keys():
+        provenance()  # reads the commit of the code that is about to run
     for number, (part, compute) in enumerate(parts.items(), 1):
         if part in known and not recompute:
             continue
         began = time.perf_counter()
         records = compute()
         source = provenance(agent, time.perf_counter() - began, **config)
+        if part in settings:
+            source["settings"] = settings[part]
         known[part] = {"records": records, "provenance": source}
         if kept:
             if another:
@@ -190,11 +200,12 @@ def _set_aside(path) -> None:
     print(f"{path.name} was of another agent or other settings, or damaged: kept as {old.name}")
 
 
-def stored_parts(name: str, agent=None, **config) -> list[str]:
+def stored_parts(name: str, agent=None, settings=None, **config) -> list[str]:
     """Names of the parts that `result_in_parts` would load for these arguments."""
     if scale() == "smoke":
         return []
-    return list(_known_parts(result_path(name), agent, config, overwrite=False))
+    known = _known_parts(result_path(name), agent, config, overwrite=False)
+    return [part for part in known if _fits(known[part], (settings or {}).get(part))]
 
 
 def stored_config(name: str, agent=None) -> dict | None:
@@ -245,6 +256,13 @@ def _known_parts(path, agent, config, overwrite: bool) -> dict:
             "recompute=True"
         ) from error
     return known
+
+
+def _fits(part: dict, settings: dict | None) -> bool:
+    """Whether a stored part has these settings of its own; None asks for none."""
+    return settings is None or part["provenance"].get("settings") == json.loads(
+        json.dumps(settings)
+    )
 
 
 def _one_record_per_line(parts: dict) -> str:

@@ -4,7 +4,7 @@ Section 4.1 (methods), Appendix D (trust region).
 """
 
 import numbers
-from dataclasses import replace
+from dataclasses import asdict, replace
 from functools import partial
 from typing import NamedTuple
 
@@ -112,7 +112,14 @@ def design_study(
     parts = {"starts and reference": partial(_initial_records, agent, robot, **setting)}
     for run in runs:
         parts[_part(run)] = partial(_run_records, agent, robot, run, short, **setting)
-    return result_in_parts(name, parts, agent, recompute, progress, **setting, **short)
+    return result_in_parts(
+        name, parts, agent, recompute, progress, _searches(runs, short), **setting, **short
+    )
+
+
+def _searches(runs, short: dict) -> dict[str, dict]:
+    """By name of the part, the settings of its search."""
+    return {_part(run): asdict(METHODS[run.method].config(**short)) for run in runs}
 
 
 def _setting(starts, episodes, horizon, seed, first_start) -> dict:
@@ -184,7 +191,8 @@ def available(
     short = {} if iterations is None else {"iterations": iterations}
     name = _file(robot, first_start)
     setting = _as_stored(name, agent, setting, short)
-    stored = [] if recompute else stored_parts(name, agent, **setting, **short)
+    searches = _searches(runs, short)
+    stored = [] if recompute else stored_parts(name, agent, searches, **setting, **short)
     here = installed(runs)
     return tuple(run for run in runs if run in here or _part(run) in stored)
 

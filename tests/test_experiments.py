@@ -141,6 +141,20 @@ def test_parts_are_stored_one_by_one_and_an_interruption_keeps_them(results):
     assert "one" in json.loads((results / "x.old2.json").read_text())["parts"]
 
 
+def test_a_part_of_other_settings_of_its_own_is_computed_anew(results):
+    one, two = Computation(), Computation()
+    parts = {"one": one, "two": two}
+    for settings in ({"one": {"rate": (1, 2)}}, {"one": {"rate": (1, 2)}}, {"one": {"rate": 3}}):
+        before = (results / "x.json").read_text() if (results / "x.json").exists() else None
+        experiments.result_in_parts("x", parts, AGENT, settings=settings)
+    assert (one.calls, two.calls) == (2, 1)
+    assert (results / "x.old.json").read_text() == before, "the other result is kept"
+    stored = json.loads((results / "x.json").read_text())["parts"]
+    assert stored["one"]["provenance"]["settings"] == {"rate": 3}
+    assert experiments.stored_parts("x", AGENT, {"one": {"rate": 3}}) == ["two", "one"]
+    assert experiments.stored_parts("x", AGENT, {"one": {"rate": 4}}) == ["two"]
+
+
 # gains
 
 

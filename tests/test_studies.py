@@ -71,6 +71,10 @@ def test_records_are_what_search_and_evaluation_give(results, agent, robot):
         ("vgds", "reference", None),
     ]
     assert study["provenance"]["agent"]["hash"] == agent.hash
+    (path,) = results.glob("design_study_*.json")
+    parts = json.loads(path.read_text())["parts"]
+    settings = parts["cem, lambda 100, from the starts"]["provenance"]["settings"]
+    assert settings == dataclasses.asdict(METHODS["cem"].config(iterations=2))
 
     space = DesignSpace(robot)
     starts = np.stack([space.start(0), space.start(1)])
