@@ -48,7 +48,7 @@ fi
 if ! fits "$venv/bin/python"; then
     rm -rf "$venv"
     if [ -n "$uv" ]; then
-        uv venv --quiet --python "${found:->=3.11,<3.14}" "$venv"
+        uv venv --quiet --seed --python "${found:->=3.11,<3.14}" "$venv"
     else
         "$found" -m venv "$venv"
     fi

@@ -106,9 +106,9 @@ def environment():
 
     step, inside = NativePhysics.step, []
 
-    def timed(self, *arguments):
+    def timed(self, *arguments, **options):
         began = time.perf_counter()
-        result = step(self, *arguments)
+        result = step(self, *arguments, **options)
         inside.append(time.perf_counter() - began)
         return result
 
@@ -200,27 +200,35 @@ def search():
 
 
 def baselines():
-    """Every other method from the ten starts in one call, after compilation. BO where BoTorch is
-    installed: it compiles nothing worth excluding and takes minutes, so it runs once."""
+    """Every other method from ten starts in one call, after compilation, for all robots of the
+    single-robot experiments. BO, where BoTorch is installed, for one of them: it takes minutes, of
+    which compilation is no part worth excluding."""
     import numpy as np
 
+    from shapebody import paper
     from shapebody.checkpoints import load_agent
     from shapebody.design import DesignSpace
+    from shapebody.experiments import trained_robots
     from shapebody.robots import load_robot
     from shapebody.search import search
     from shapebody.studies import METHOD_RUNS, installed
 
-    robot, agent = load_robot(ROBOT), load_agent(ROBOT)
-    space = DesignSpace(robot)
-    starts = np.stack([space.start(i) for i in range(10)])
     rows = {}
-    for run in installed(METHOD_RUNS):
-        if run.method == "vgds":
-            continue
-        if run.method != "bo":
-            search(run.method, agent, robot, starts)
-        found = search(run.method, agent, robot, starts)
-        rows[f"{run.method}, ten designs"] = (found.seconds, "s")
+    for name in trained_robots(paper.ROBOTS):
+        robot, agent = load_robot(name), load_agent(name)
+        space = DesignSpace(robot)
+        starts = np.stack([space.start(i) for i in range(10)])
+        where = "" if name == ROBOT else f", {name}"
+        for run in installed(METHOD_RUNS):
+            if run.method == "vgds" and name == ROBOT:
+                continue  # the benchmark "search" has it
+            if run.method == "bo":
+                if name != ROBOT:
+                    continue
+            else:
+                search(run.method, agent, robot, starts)
+            found = search(run.method, agent, robot, starts)
+            rows[f"{run.method}, ten designs{where}"] = (found.seconds, "s")
     return rows
 
 
@@ -268,7 +276,9 @@ def main():
         enable_compilation_cache()
         print(json.dumps(BENCHMARKS[options.names[0]]()))
         return
-    rows = {}
+    from shapebody.experiments import provenance
+
+    source = provenance(robot=ROBOT, environments=ENVIRONMENTS)
     for name in options.names or BENCHMARKS:
         environment = dict(os.environ)
         if name in ("training", "fifty"):
@@ -278,28 +288,28 @@ def main():
         output = subprocess.run(
             command, env=environment, check=True, stdout=subprocess.PIPE, text=True
         ).stdout
+        rows = {}
         for label, (value, unit) in json.loads(output.splitlines()[-1]).items():
             rows[label] = {"value": value, "unit": unit, "benchmark": name}
+            rows[label]["commit"] = source["commit"]
             print(f"{label:52s} {value:12,.2f} {unit}", flush=True)
-    from shapebody.experiments import provenance
-
-    source = provenance(robot=ROBOT, environments=ENVIRONMENTS)
-    rows = {label: {**row, "commit": source["commit"]} for label, row in rows.items()}
-    if os.path.exists(options.out):  # benchmarks that did not run this time keep their rows
-        ran = {row["benchmark"] for row in rows.values()}
-        with open(options.out) as file:
-            old = json.load(file)["rows"].items()
-        kept = {label: row for label, row in old if row.get("benchmark", "import") not in ran}
-        rows = {**kept, **rows}
-    rows = with_ratios(rows)
+        rows = _written(options.out, name, rows, source)
     for label, row in rows.items():
         if label.startswith("environment / "):
             print(f"{label:52s} {row['value']:12.2f}")
-    record = {"rows": rows, "provenance": source}
-    temporary = options.out + ".tmp"
-    with open(temporary, "w") as file:
-        json.dump(record, file, indent=1)
-    os.replace(temporary, options.out)
+
+
+def _written(path, name, rows, source):
+    """Put the rows of a benchmark into the file; those of others stay. Returns all rows."""
+    if os.path.exists(path):
+        with open(path) as file:
+            old = json.load(file)["rows"].items()
+        rows = {k: row for k, row in old if row.get("benchmark", "import") != name} | rows
+    rows = with_ratios(rows)
+    with open(path + ".tmp", "w") as file:
+        json.dump({"rows": rows, "provenance": source}, file, indent=1)
+    os.replace(path + ".tmp", path)
+    return rows
 
 
 if __name__ == "__main__":

@@ -35,6 +35,7 @@ import jax
 import numpy as np
 import safetensors.numpy
 
+from .checks import require_kind
 from .descriptions import Descriptions, Sizes
 from .files import (
     atomic_write,
@@ -212,6 +213,11 @@ def _commit() -> str | None:
 # ---------------------------------------------------------------------- agents
 
 
+def require_agent(agent) -> None:
+    """TypeError if it is no `Agent`, for example the name of one."""
+    require_kind("agent", agent, Agent, "load it with shapebody.load_agent(...)")
+
+
 def agents() -> list[str]:
     """Names of the agents in `data/checkpoints`, sorted."""
     return sorted(
@@ -296,6 +302,8 @@ def load_agent(name_or_folder: str | Path) -> Agent:
         name, robots = document["name"], tuple(document["robots"])
         weights_hash, states_hash = document["hash"], document["states_hash"]
         metadata, configuration_hash = document["metadata"], document["configuration_hash"]
+        if not isinstance(metadata, dict) or not isinstance(metadata.get("steps", 0), int):
+            raise TypeError("metadata is no object, or its steps are no integer")
     except (KeyError, TypeError, ValueError) as error:
         raise ValueError(
             f"{folder / DESCRIPTION} is not a valid agent description "

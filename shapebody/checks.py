@@ -13,4 +13,5 @@ def require_integer(name: str, value, least: int = 0) -> int:
 def require_kind(name: str, value, kind: type, hint: str) -> None:
     """TypeError if the value is no instance of `kind`; `hint` says how to come by one."""
     if not isinstance(value, kind):
-        raise TypeError(f"{name} is {value!r}; expected a {kind.__name__}: {hint}")
+        article = "an" if kind.__name__[0] in "AEIOU" else "a"
+        raise TypeError(f"{name} is {value!r}; expected {article} {kind.__name__}: {hint}")

@@ -192,7 +192,13 @@ class DesignSpace:
 
     def validate(self, f) -> np.ndarray:
         """Return f as float32 [..., d]; ValueError if its length, finiteness or box is wrong."""
-        f = np.asarray(f, np.float32)
+        try:
+            f = np.asarray(f, np.float32)
+        except (TypeError, ValueError) as error:
+            raise ValueError(
+                f"design is {f!r}, expected {self.dim} numbers; use a design of robot "
+                f"{self.robot.name!r}, such as space.start(0)"
+            ) from error
         self._check_length(f)
         if not np.all(np.isfinite(f)):
             where = np.argwhere(~np.isfinite(f))[0]

@@ -13,7 +13,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from shapebody.checkpoints import Agent
+from shapebody.checkpoints import Agent, require_agent
 from shapebody.checks import require_integer, require_kind
 from shapebody.design import DesignSpace
 from shapebody.locomotion import Locomotion, TaskConfig
@@ -145,6 +145,7 @@ def evaluate(
         ValueError: for designs of a wrong length, outside the box or not finite, a wrong number
             of episodes, an unknown engine.
     """
+    require_agent(agent)
     config = config or EvaluationConfig()
     if episodes is not None:
         config = dataclasses.replace(config, episodes=episodes)

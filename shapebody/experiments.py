@@ -319,7 +319,8 @@ def scales_table() -> list[dict]:
 
     Beside sizes and budgets, these are three settings of training: `reduced` and `smoke`
     standardize the networks' inputs, give the critic's targets a larger λ, and end the policy's
-    advantages where the command changes.
+    advantages where the command changes. A fourth, the softmax temperature at the start, is among
+    the networks' (`PolicyConfig`, `CriticConfig`).
     """
     from shapebody.ppo import TrainConfig
 
@@ -379,7 +380,13 @@ def derived_constants(
 
 
 def before_after(agent, robot, path, start: int = 3, trust_region: float = 100.0) -> None:
-    """Save a picture of a start design, the design VGDS finds from it, and the reference."""
+    """Save a picture of a start design, the design VGDS finds from it, and the reference.
+
+    The PNG's text entry "provenance" says of which agent.
+    """
+    from PIL import Image
+    from PIL.PngImagePlugin import PngInfo
+
     from shapebody import video
     from shapebody.design import DesignSpace
     from shapebody.search import search
@@ -390,6 +397,8 @@ def before_after(agent, robot, path, start: int = 3, trust_region: float = 100.0
     models = [space.to_model(x) for x in (f, found, space.reference)]
     labels = [f"start design {start}", "found by VGDS", "reference"]
     picture = video.body_grid(models, labels=labels, columns=3)
-    from PIL import Image
-
-    Image.fromarray(picture).save(path)
+    source = PngInfo()
+    source.add_text(
+        "provenance", json.dumps(provenance(agent, start=start, trust_region=trust_region))
+    )
+    Image.fromarray(picture).save(path, pnginfo=source)

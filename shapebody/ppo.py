@@ -862,7 +862,7 @@ def _keep_agent(folder: Path, steps: int, others: str = "") -> None:
         )
 
 
-def _keep_critic(folder: Path, others: str) -> None:
+def _keep_critic(folder: Path, others: str = "") -> None:
     """Raise ValueError if the agent in a folder has a critic from policy evaluation."""
     if "policy_evaluation" in (_metadata(folder) or {}):
         raise ValueError(
@@ -895,15 +895,16 @@ def anneal(
         folder: of the run, instead of data/checkpoints/<name>. The agent is saved there; the copy
             is in a folder in it until it is finished.
         progress, max_seconds, engine: see `train`. A copy that was stopped is continued.
-        replace: replace the agent in the folder even if it has more steps than the copy will have.
+        replace: replace the agent in the folder even if it has more steps than the copy will have,
+            or a critic from policy evaluation.
 
     Returns:
         The agent; None if the copy was stopped before its end, which leaves the old agent.
 
     Raises:
         ValueError: if there is no such run, its files are damaged, its rate is below `last_rate`,
-            the agent in the folder has more steps, or the copy that was stopped is of another step
-            of the run or has other settings.
+            the agent in the folder has more steps or a critic from policy evaluation, or the copy
+            that was stopped is of another step of the run or has other settings.
     """
     folder = Path(folder) if folder else data_dir() / "checkpoints" / name
     copy = folder / "annealed"
@@ -943,7 +944,7 @@ def _begin_annealing(
             f"last_rate is {last_rate:g}, above the present rate of the run, {rate:g}: give a "
             "lower one"
         )
-    more = max(1, round(steps / batch))
+    more = max(1, round(require_integer("steps", steps, 1) / batch))
     # Linear over the whole run, through the present rate now and the last one at the end.
     slope = (last_rate - rate) / more
     config |= {
@@ -952,6 +953,7 @@ def _begin_annealing(
     }
     if not replace:
         _keep_agent(folder, config["total_steps"])
+        _keep_critic(folder)
     phases.append({"from_step": done * batch, "config": config})
     if (copy / "training.safetensors").exists():
         if json.loads((copy / "training.json").read_text()) != phases:

@@ -13,7 +13,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from shapebody.checkpoints import Agent
+from shapebody.checkpoints import Agent, require_agent
 from shapebody.descriptions import Descriptions
 from shapebody.design import DesignSpace
 from shapebody.locomotion import CONTROL_STEP, Locomotion, Observation, TaskConfig, randomization
@@ -96,6 +96,7 @@ def record_episode(
     Raises:
         ValueError: for a design, command, length or coefficient that is not as described.
     """
+    require_agent(agent)
     space = DesignSpace(robot)
     design = space.validate(space.reference if design is None else design)
     if design.ndim != 1:

@@ -11,6 +11,7 @@ from typing import NamedTuple
 import numpy as np
 
 from shapebody import paper
+from shapebody.checkpoints import require_agent
 from shapebody.checks import require_integer, require_kind
 from shapebody.design import DesignSpace
 from shapebody.evaluation import EvaluationConfig, evaluate, paired_gain
@@ -100,6 +101,7 @@ def design_study(
     Raises:
         ValueError: for a run or a setting that cannot be, before anything is computed.
     """
+    require_agent(agent)
     setting = _setting(starts, episodes, horizon, seed, first_start)
     for name, value in setting.items():
         require_integer(name, value, 0 if name in ("seed", "first_start") else 1)

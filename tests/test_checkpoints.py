@@ -287,6 +287,10 @@ def test_files_that_were_edited(agent, folder):
     edit(lambda document: document["policy_config"].update(unknown=1))
     with pytest.raises(ValueError, match="agent.json is not a valid agent description"):
         load_agent(folder)
+    for metadata in (None, {"steps": "many"}):
+        edit(lambda document, metadata=metadata: document.update(metadata=metadata))
+        with pytest.raises(ValueError, match="agent.json is not a valid agent desc.*metadata"):
+            load_agent(folder)
     edit(lambda document: document.pop("robots"))
     with pytest.raises(ValueError, match="agent.json is not a valid agent description.*robots"):
         load_agent(folder)

@@ -1,6 +1,7 @@
 """The locomotion task: rewards, curriculum, commands, padding, failure, resume, two engines."""
 
 import importlib.util
+import json
 from dataclasses import fields, replace
 from pathlib import Path
 
@@ -455,11 +456,32 @@ def test_designs_at_every_distance(go2):
             TaskConfig(design_radius=wrong)
 
 
-def test_ratios_of_benchmarks_follow_their_rows():
+@pytest.fixture
+def benchmarks():
     path = Path(__file__).parents[1] / "benchmarks" / "run.py"
     spec = importlib.util.spec_from_file_location("benchmarks_run", path)
-    benchmarks = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(benchmarks)
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+def test_benchmark_of_the_environment_runs(benchmarks, monkeypatch):
+    from shapebody.physics.native import NativePhysics
+
+    monkeypatch.setattr(NativePhysics, "step", NativePhysics.step)  # restored afterwards
+    monkeypatch.setattr(benchmarks, "ENVIRONMENTS", 4)
+    rows = benchmarks.environment()
+    assert 0 < rows["environment, C engine"][0] <= rows["C engine inside it"][0]
+
+
+def test_benchmarks_keep_the_rows_of_others(benchmarks, tmp_path):
+    path = str(tmp_path / "results.json")
+    for name, label in [("engine", "a"), ("environment", "b"), ("engine", "c")]:
+        rows = benchmarks._written(path, name, {label: {"value": 1, "benchmark": name}}, {})
+    assert list(rows) == ["b", "c"] == list(json.loads(Path(path).read_text())["rows"])
+
+
+def test_ratios_of_benchmarks_follow_their_rows(benchmarks):
     rows = {
         "environment, C engine": {"value": 3.0, "commit": "new"},
         "C engine alone": {"value": 4.0, "commit": "old"},

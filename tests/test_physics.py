@@ -328,6 +328,25 @@ def test_native_error_is_contained(native, controls, monkeypatch):
     np.testing.assert_array_equal(readings.qpos[4], native.robot.home)
 
 
+def test_mjx_sensor_values_that_are_not_finite_are_failures(
+    mjx_physics, embodiments, controls, robot, monkeypatch
+):
+    from mujoco import mjx
+
+    physics, _ = mjx_physics
+    state = physics.init(embodiments, robot.home, np.zeros(robot.model.nv))
+    step = mjx.step
+
+    def broken(model, data):
+        data = step(model, data)
+        bad = jnp.where(data.qpos[2] > 0, jnp.inf, data.sensordata[-1])
+        return data.replace(sensordata=data.sensordata.at[-1].set(bad))
+
+    monkeypatch.setattr(mjx, "step", broken)
+    _, *readings = physics.step(state, controls[0])
+    assert not readings[3].any() and np.isfinite(readings[2]).all()
+
+
 @pytest.mark.parametrize("failure", FAILURES)
 def test_mjx_failure_is_contained(failure, mjx_physics, embodiments, controls, robot):
     physics, step = mjx_physics

@@ -358,6 +358,14 @@ def test_annealing_leaves_the_run_as_it_is(config, tmp_path, monkeypatch):
         ppo.anneal("walker", **arguments | {"steps": config.batch})
     with pytest.raises(ValueError, match="last_rate is 0.01, above the present rate"):
         ppo.anneal("walker", **arguments | {"last_rate": 1e-2})
+    for steps in (0, -5, 1.5):
+        with pytest.raises(ValueError, match=f"steps is {steps}; expected an integer of at least"):
+            ppo.anneal("walker", **arguments | {"steps": steps})
+    document = json.loads((tmp_path / "agent.json").read_text())
+    document["metadata"]["policy_evaluation"] = {}
+    (tmp_path / "agent.json").write_text(json.dumps(document))
+    with pytest.raises(ValueError, match="critic from policy evaluation"):
+        ppo.anneal("walker", **arguments | {"steps": 9 * config.batch})
     assert not (tmp_path / "annealed").exists() and load_agent(tmp_path).hash == agent.hash
     arguments |= {"steps": 2 * config.batch, "replace": True}
     assert ppo.anneal("walker", max_seconds=0.0, **arguments) is None

@@ -12,10 +12,13 @@ from tiny import quick_compilation, tiny_agent, tiny_robot
 
 from shapebody.descriptions import describe
 from shapebody.design import DesignSpace
+from shapebody.evaluation import evaluate
 from shapebody.locomotion import Locomotion
+from shapebody.recording import record_episode
 from shapebody.search import Objective, VGDSConfig, search
 from shapebody.search import objective as objectives
 from shapebody.search.vgds import penalty_only, vgds
+from shapebody.studies import design_study
 
 BATCH = dict(batch_size=8)
 """One size of minibatches for all searches here, so that few programs are compiled."""
@@ -152,6 +155,15 @@ def test_penalty_only_ignores_the_critic(agent, robot, starts):
 def test_names_and_broken_seeds_are_no_arguments(agent, robot):
     with pytest.raises(TypeError, match=r"expected a Robot: load it with shapebody.load_robot"):
         search("vgds", agent, robot.name, DesignSpace(robot).reference)
+    for function in (
+        lambda: search("vgds", "unitree_go2", robot, DesignSpace(robot).reference),
+        lambda: Objective.of("unitree_go2", robot),
+        lambda: evaluate("unitree_go2", robot, DesignSpace(robot).reference),
+        lambda: record_episode("unitree_go2", robot),
+        lambda: design_study("unitree_go2", robot),
+    ):
+        with pytest.raises(TypeError, match="agent is 'unitree_go2'; expected an Agent: load it"):
+            function()
     with pytest.raises(ValueError, match="seed is 1.5; expected an integer of at least 0"):
         search("vgds", agent, robot, DesignSpace(robot).reference, seed=1.5)
     with pytest.raises(TypeError, match="expected a Robot"):

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from PIL import Image
 from test_networks import published_layers, write_published
 from tiny import quick_compilation, tiny_agent, tiny_robot
 
@@ -258,6 +259,36 @@ def test_readme_states_the_stored_results():
             + "|"
         )
         assert row in readme, f"README.md should have: {row}"
+        assert [len(some[0]["returns"]) for some in (records, others)] == [200, 50]
+    assert "over starts and episodes (200; 50 in the last column)" in readme.replace("\n", " ")
+
+
+def test_stored_results_belong_to_the_shipped_agents():
+    folder = data_dir() / "results"
+    seen = set()
+    for path in sorted(folder.glob("*.json")):
+        for part in json.loads(path.read_text())["parts"].values():
+            source = part["provenance"].get("agent")
+            if source:
+                assert source["hash"] == load_agent(source["name"]).hash, path.name
+                seen.add(path.name)
+    assert len(seen) >= 3 * len(experiments.trained_robots(paper.ROBOTS))
+    with Image.open(folder / "before_after.png") as picture:
+        source = json.loads(picture.text["provenance"])
+    assert source["agent"]["hash"] == load_agent("unitree_go2").hash
+
+
+@pytest.mark.parametrize("name", paper.ROBOTS)
+def test_stored_studies_are_whole(name):
+    """All methods and all λ, with today's settings and the paper's 200 episodes."""
+    robot, agent = load_robot(name), load_agent(name)
+    runs = (*studies.METHOD_RUNS, *studies.TRUST_REGION_RUNS)
+    setting = dict(starts=10, episodes=200, horizon=1000)
+    assert studies.available(agent, robot, runs, **setting) == runs
+    stored = experiments.stored_parts(
+        f"design_study_{name}", agent, studies._searches(runs, {}), **setting, seed=0
+    )
+    assert {studies._part(run) for run in runs} <= set(stored)
 
 
 def test_published_policy(results, agent, robot, tmp_path, monkeypatch):

@@ -207,6 +207,7 @@ class MjxPhysics:
             with _box_contacts_as_in_c():
                 data = mjx.step(model, data)
             finite &= _valid(data.qacc) & _valid(data.qpos) & _valid(data.qvel)
+            finite &= jnp.all(jnp.isfinite(data.sensordata))
             return (data.qpos, data.qvel, data.qacc_warmstart, data.sensordata, finite), None
 
         finite = _valid(qpos) & _valid(qvel) & _valid(ctrl)

@@ -200,6 +200,6 @@ def _require_botorch():
     except ImportError as error:
         raise ImportError(
             "method 'bo' needs PyTorch and BoTorch, which are not part of environment.lock; "
-            "install them with: pip install 'shapebody[bo]' (in this repository: "
-            ".venv/bin/python -m pip install -e '.[bo]')"
+            "install them, in the folder of this repository, with: "
+            ".venv/bin/python -m pip install -e '.[bo]'"
         ) from error

@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from shapebody.checkpoints import Agent
+from shapebody.checkpoints import Agent, require_agent
 from shapebody.checks import require_integer
 from shapebody.descriptions import Descriptions, Sizes, describe
 from shapebody.design import DesignSpace
@@ -105,9 +105,11 @@ class Objective:
             batch_size: states per minibatch.
 
         Raises:
+            TypeError: for an agent or robot that is none, such as its name.
             ValueError: for a λ that is negative or not finite, a wrong reference or batch size,
                 and an agent without states that fit the robot.
         """
+        require_agent(agent)
         if not (isinstance(trust_region, numbers.Real) and 0 <= trust_region < np.inf):
             raise ValueError(
                 f"trust_region is {trust_region!r}; expected a finite number of at least 0 "
