@@ -449,7 +449,9 @@ def check_radius(function, dim: int = 358) -> None:
         balance = dim * abs(g) / (2 * trust_region)
         if abs(given - min(balance, 1.0)) < 1e-3:
             continue
-        if abs(given - balance) < 1e-3:
+        if given < 0:
+            hint = "A distance is not negative: the sign of g says only to which side."
+        elif abs(given - balance) < 1e-3:
             hint = "No entry can leave the box, so the distance from f = 0 is at most 1."
         elif abs(abs(given) - 2 * min(balance, 1.0)) < 1e-3:
             hint = "The derivative of a square brings a factor of 2."
