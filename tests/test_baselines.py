@@ -523,7 +523,7 @@ def test_gc_pfo_resamples_by_value():
 
 def test_without_botorch_the_error_names_the_fix(monkeypatch):
     monkeypatch.setitem(sys.modules, "botorch", None)
-    with pytest.raises(ImportError, match=r"pip install 'shapebody\[bo\]'"):
+    with pytest.raises(ImportError, match=r"pip install -e '\.\[bo\]'"):
         run("bo", Quadratic(jnp.zeros(4)), uniform(1, 4))
 
 
