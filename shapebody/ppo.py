@@ -1098,8 +1098,11 @@ CHANGEABLE = (
     "cut_at_commands",
     "state_bank",
 )
-"""Fields that may change when a run is continued, and policy.std_limits, the limits of the
-exploration noise; each change is recorded."""
+"""Fields that may change when a run is continued; each change is recorded."""
+
+CHANGEABLE_INSIDE = {"policy": ("std_limits",), "task": ("horizon", "curriculum_length")}
+"""What may change inside other fields: the limits of the exploration noise, and the lengths of
+episodes (those that are under way keep theirs)."""
 
 
 def as_continued(config: TrainConfig, folder=None) -> TrainConfig:
@@ -1107,7 +1110,7 @@ def as_continued(config: TrainConfig, folder=None) -> TrainConfig:
 
     `config` itself if there is none, or one of other robots or of another scale. So a run goes on
     with the settings that it was begun with, whatever the defaults are now. To change one that may
-    change (`CHANGEABLE`), replace it in the result.
+    change (`CHANGEABLE`, `CHANGEABLE_INSIDE`), replace it in the result.
     """
     folder = Path(folder) if folder else data_dir() / "checkpoints" / config.name
     if not (folder / "training.safetensors").exists():
@@ -1154,7 +1157,8 @@ def _continued(path: Path, config: TrainConfig, steps: int, robots=()) -> list[d
     with hashes of the robots' files and the name of the engine.
 
     Raises:
-        ValueError: if more than `CHANGEABLE`, or a robot's file, differs from the run in `path`.
+        ValueError: if more than what is changeable, or a robot's file, differs from the run in
+            `path`.
     """
     try:
         phases = json.loads(path.read_text())
@@ -1175,8 +1179,11 @@ def _continued(path: Path, config: TrainConfig, steps: int, robots=()) -> list[d
         ) from error
     now = _plain(config)
     different = [name for name in now if before.get(name) != now[name]]
-    limits = {"std_limits": now["policy"]["std_limits"]}
-    changeable = CHANGEABLE + ("policy",) * (before["policy"] | limits == now["policy"])
+    changeable = list(CHANGEABLE)
+    for field_name, inside in CHANGEABLE_INSIDE.items():
+        new = {name: now[field_name][name] for name in inside}
+        if before[field_name] | new == now[field_name]:
+            changeable.append(field_name)
     other = [name for name in different if name not in changeable]
     if other:
         text = "; ".join(_difference(name, before.get(name), now[name]) for name in other)

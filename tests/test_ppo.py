@@ -304,6 +304,17 @@ def test_a_run_continues_only_with_its_own_configuration(config, tmp_path):
         ppo.Trainer(scaled, tmp_path).start()
     quiet = replace(config, policy=replace(config.policy, std_limits=(0.05, 2.0)))
     assert ppo.Trainer(quiet, tmp_path).start()  # the limits of the noise may change
+    shorter = replace(config, task=replace(config.task, horizon=6, curriculum_length=3))
+    brief = ppo.Trainer(shorter, tmp_path)
+    assert brief.start()
+    before = np.asarray(brief.state.horizon)  # an episode that is under way keeps its length
+    brief.run(max_steps=brief.steps + 2 * config.batch, progress=False)
+    after = np.asarray(brief.state.horizon)
+    assert set(after) <= {6} | set(before) and 6 in after
+    (tmp_path / "training.json").write_text(json.dumps(longer.phases))
+    rougher = replace(shorter, task=replace(shorter.task, push_probability=0.5))
+    with pytest.raises(ValueError, match="task.push_probability was 0.002, is 0.5"):
+        ppo.Trainer(rougher, tmp_path).start()
     # The field is named even where the arrays have other shapes.
     wider = replace(config, policy=replace(config.policy, core_widths=(12, 8)))
     with pytest.raises(ValueError, match=r"core_widths was \[16, 8\], is \[12, 8\]"):
