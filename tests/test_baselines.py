@@ -611,10 +611,10 @@ def test_the_shipped_agent(name):
 @pytest.mark.parametrize(
     "body, name",
     [
-        *(("mit_humanoid", name) for name in ("cma-es", "turbo", "gc-pfo")),
-        *(("golem", name) for name in ("random", "pso", "de", "ars")),
+        *(("mit_humanoid", name) for name in ("vgds", "cma-es", "turbo", "gc-pfo")),
+        *(("golem", name) for name in ("random", "pso", "cem", "de", "ars")),
     ],
 )
 def test_larger_robots(name, body):
-    robot = load_robot(body)
-    check_large(tiny_agent(robot), robot, name, batch_size=8)
+    settings = {"de": dict(initial_std=0.5)}.get(name, {})
+    check_large(load_agent(body), load_robot(body), name, batch_size=8, **settings)

@@ -291,6 +291,34 @@ def test_stored_studies_are_whole(name):
     assert {studies._part(run) for run in runs} <= set(stored)
 
 
+def test_size_share_takes_the_found_designs_apart(agent, robot, monkeypatch):
+    setting = dict(starts=2, episodes=2, horizon=12, iterations=3)
+    walked = []
+
+    def seen(agent, robot, designs, **rest):
+        walked.append(designs)
+        return evaluate(agent, robot, designs, **rest)
+
+    monkeypatch.setattr(studies, "evaluate", seen)
+    records = studies.size_share(agent, robot, **setting)
+    kinds = ("all", "size only", "all but size")
+    expected = [("reference", None), *((kind, i) for kind in kinds for i in range(2))]
+    assert [(r["kept"], r["start"]) for r in records] == expected
+    (designs,) = walked
+    space = DesignSpace(robot)
+    initial = np.stack([space.start(i) for i in range(2)])
+    found = search("vgds", agent, robot, initial, trust_region=100.0, iterations=3).design
+    reference, everything, size, rest = np.split(designs, [1, 3, 5])
+    assert not reference.any()
+    np.testing.assert_array_equal(everything, found)
+    np.testing.assert_array_equal(size[:, :3], found[:, :3])
+    np.testing.assert_array_equal(size + rest, found)
+    assert not size[:, 3:].any() and not rest[:, :3].any()
+    predicted = Objective.of(agent, robot, 0.0).value(designs)
+    np.testing.assert_allclose([r["predicted_value"] for r in records], predicted, rtol=1e-5)
+    assert all(len(r["returns"]) == 2 for r in records)
+
+
 def test_published_policy(results, agent, robot, tmp_path, monkeypatch):
     with pytest.raises(FileNotFoundError, match="folder of the authors' weights"):
         studies.published_policy(robot, agent)
