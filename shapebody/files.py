@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import csv
+import fcntl
 import os
 import secrets
 import signal
@@ -63,6 +64,29 @@ def _uninterrupted():
         signal.signal(signal.SIGINT, signal.SIG_DFL if before is None else before)
     if held:
         signal.raise_signal(signal.SIGINT)
+
+
+@contextlib.contextmanager
+def alone_in(folder: str | Path):
+    """Keep other processes, and other blocks like this, out of a folder while the block runs.
+
+    The operating system forgets the lock when the process ends, however it ends.
+
+    Raises:
+        ValueError: if the folder is taken.
+    """
+    handle = os.open(folder, os.O_RDONLY)
+    try:
+        try:
+            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError as error:
+            raise ValueError(
+                f"another training run is at work in {folder}; wait for it, stop it, or choose "
+                "another name or folder"
+            ) from error
+        yield
+    finally:
+        os.close(handle)
 
 
 def read_curve(path: str | Path) -> dict[str, np.ndarray]:

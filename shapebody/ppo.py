@@ -39,7 +39,7 @@ from shapebody.checkpoints import (
     save_arrays,
 )
 from shapebody.checks import require_integer, require_kind
-from shapebody.files import read_safetensors
+from shapebody.files import alone_in, read_safetensors
 from shapebody.locomotion import Locomotion, TaskConfig, Trajectory
 from shapebody.locomotion.observations import COMMAND, Observation
 from shapebody.networks import (
@@ -686,6 +686,9 @@ class Trainer:
             max_seconds: stop after this many seconds of this call.
             progress: print a line every few seconds.
             curve_interval: iterations per row of the learning curve, CURVE_INTERVAL if not given.
+
+        Raises:
+            ValueError: if another process trains in the same folder.
         """
         config = self.config
         number, last = int(self.learner.iteration), self.last_iteration(max_steps)
@@ -698,10 +701,10 @@ class Trainer:
             else:
                 self.env.physics_state = self.saved_physics
         self.in_step = False
-        curve = _Curve(self.folder / "training.csv", self.steps)
         # On an accelerator there is nothing to overlap: the device does one thing at a time.
         overlap = self.env.engine == "native"
-        with ThreadPoolExecutor(1) as actor:
+        with alone_in(self.folder), ThreadPoolExecutor(1) as actor:
+            curve = _Curve(self.folder / "training.csv", self.steps)
             state, trajectory = self._collect(self.behaviour, self.state, number)
             mark = time.monotonic()
             until = mark + (math.inf if max_seconds is None else max_seconds)

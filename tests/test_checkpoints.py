@@ -204,8 +204,13 @@ def test_an_interrupt_between_two_files_waits_for_the_last(agent, folder, monkey
         move(*paths)
 
     monkeypatch.setattr("os.replace", interrupted)
-    with pytest.raises(KeyboardInterrupt):
-        save_agent(other, folder)
+    # A shell starts what it runs in the background with this signal ignored.
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    try:
+        with pytest.raises(KeyboardInterrupt):
+            save_agent(other, folder)
+    finally:
+        signal.signal(signal.SIGINT, before)
     monkeypatch.undo()
     assert load_agent(folder).hash == other.hash != agent.hash
 

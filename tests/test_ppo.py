@@ -14,6 +14,7 @@ import pytest
 
 from shapebody import ppo
 from shapebody.checkpoints import load_agent, load_curve, save_agent
+from shapebody.files import alone_in
 from shapebody.locomotion.observations import Observation
 from shapebody.networks import CriticConfig
 
@@ -335,6 +336,16 @@ def test_a_run_continues_only_with_its_own_configuration(config, tmp_path):
         longer.start()
     (tmp_path / "training.safetensors").rename(tmp_path / "gone")
     assert ppo.as_continued(config, tmp_path) == config  # a new run, with today's settings
+
+
+def test_two_runs_in_one_folder(config, tmp_path):
+    trainer = ppo.Trainer(config, tmp_path)
+    trainer.start()
+    with alone_in(tmp_path), pytest.raises(ValueError, match="another training run is at work in"):
+        trainer.run(max_steps=config.batch, progress=False)
+    assert list(tmp_path.iterdir()) == []
+    trainer.run(max_steps=config.batch, progress=False)  # free again
+    assert trainer.steps == config.batch
 
 
 def test_annealing_leaves_the_run_as_it_is(config, tmp_path, monkeypatch):
