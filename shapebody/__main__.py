@@ -8,7 +8,7 @@ import sys
 # It must be said before JAX starts.
 _FLAG = "--xla_cpu_multi_thread_eigen=false"
 
-_REPLACE = "replace the saved agent even if it has more steps"
+_REPLACE = "replace the saved agent even if it has more steps, or a critic made by sharpen"
 
 
 def main(arguments=None) -> int:
@@ -196,7 +196,14 @@ def _check_out(out, robot) -> None:
 
 
 def _warn_of_another_file(agent, robot) -> None:
-    """Say so if the robot's file is not the one on which the agent was trained."""
+    """Say so if the robot, or its file, is not one on which the agent was trained."""
+    if robot.name not in agent.robots:
+        print(
+            f"shapebody: warning: agent {agent.name} was trained on {', '.join(agent.robots)}, not "
+            f"on {robot.name}; what it says of this robot is a guess",
+            file=sys.stderr,
+        )
+        return
     phases = agent.metadata.get("phases") or [{}]
     known = phases[0].get("robots", {}).get(robot.name, robot.hash)
     if known != robot.hash:
@@ -237,10 +244,7 @@ def _evaluate(options):
     score = evaluate(
         agent, robot, f, episodes=options.episodes, seed=options.seed, engine=options.engine
     )
-    low, high = score.interval()
-    print(f"return {score.mean:.2f} (95 % interval {low:.2f} to {high:.2f})")
-    print(f"x-y tracking error {score.tracking_error.mean():.3f} m/s")
-    print(f"episode length {score.lengths.mean():.0f} control steps")
+    print(score.summary())
 
 
 if __name__ == "__main__":

@@ -147,6 +147,7 @@ def evaluate(
     """
     require_agent(agent)
     config = config or EvaluationConfig()
+    require_kind("config", config, EvaluationConfig, "shapebody.EvaluationConfig(...)")
     if episodes is not None:
         config = dataclasses.replace(config, episodes=episodes)
     require_integer("seed", seed)

@@ -111,11 +111,11 @@ class TrainConfig:
 
     def __post_init__(self):
         robots = (self.robots,) if isinstance(self.robots, str | Path) else tuple(self.robots)
+        names = [_robot_name(robot) for robot in robots]
         robots = tuple(str(robot) for robot in robots)
         object.__setattr__(self, "robots", robots)
         if not robots:
             raise ValueError("robots is (); expected at least one name or path")
-        names = [_robot_name(robot) for robot in robots]
         if len(set(names)) < len(names):
             raise ValueError(
                 f"robots is {robots!r}; expected robots of different names: a robot is known by "
@@ -248,7 +248,11 @@ def _default_name(robot: str, changes: dict) -> str:
 
 def _robot_name(name_or_path) -> str:
     """The name of a robot that is given by name or file, without reading the file."""
-    return Path(str(name_or_path)).stem
+    if not isinstance(name_or_path, str | Path):
+        raise TypeError(
+            f"a robot is {name_or_path!r}; expected a name or the path of a file, as a text or Path"
+        )
+    return Path(name_or_path).stem
 
 
 def _is_number(value, high: float) -> bool:
@@ -793,7 +797,8 @@ def train(
     the folder as it is, with the critic that `train_critic` may have given it.
 
     Args:
-        config: the run, for example `TrainConfig.reduced("unitree_go2")`.
+        config: the run, for example `TrainConfig.reduced("unitree_go2")`. If it is the default of
+            its scale, a run in the folder goes on with the settings that it has (`as_continued`).
         folder: where the agent is kept; data/checkpoints/<name> by default. A run that was
             stopped there is continued exactly where it was.
         progress: print return, tracking error, curriculum coefficient, speed and time left.
@@ -812,6 +817,10 @@ def train(
             steps than the run that is to go on, or if the run there cannot be continued with
             `config`.
     """
+    require_kind("config", config, TrainConfig, 'for example TrainConfig.reduced("unitree_go2")')
+    given = {"robots": config.robots, "name": config.name}
+    if config == TrainConfig.at_scale(config.scale, config.robots[0], **given):
+        config = as_continued(config, folder)
     if max_steps is not None and max_steps < config.batch:
         raise ValueError(
             f"max_steps is {max_steps}; one iteration is {config.batch} steps: give at least as "

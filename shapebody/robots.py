@@ -273,24 +273,47 @@ def check_joints(model: mujoco.MjModel) -> Iterator[str]:
             )
 
 
+DOF_FIELDS = ("dof_damping", "dof_armature", "dof_frictionloss")
+"""Properties of joints that MuJoCo keeps per degree of freedom."""
+
+
+def _owner(model, kind, index: int) -> str:
+    """Name of an object; of a degree of freedom, that of its joint."""
+    if kind == _OBJ.mjOBJ_DOF:
+        kind, index = _OBJ.mjOBJ_JOINT, model.dof_jntid[index]
+    return _name(model, kind, index)
+
+
 def check_numbers(model: mujoco.MjModel) -> Iterator[str]:
-    """Finite numbers."""
+    """Finite numbers, and none below zero where that means nothing."""
     for fields, kind in (
         (("body_pos", "body_quat", "body_ipos", "body_mass", "body_inertia"), _OBJ.mjOBJ_BODY),
         (("jnt_pos", "jnt_axis", "jnt_range", "jnt_stiffness"), _OBJ.mjOBJ_JOINT),
         (("geom_pos", "geom_quat", "geom_size"), _OBJ.mjOBJ_GEOM),
         (("actuator_gainprm", "actuator_biasprm", "actuator_forcerange"), _OBJ.mjOBJ_ACTUATOR),
         (("key_qpos",), _OBJ.mjOBJ_KEY),
+        (("site_pos", "site_quat"), _OBJ.mjOBJ_SITE),
+        (DOF_FIELDS, _OBJ.mjOBJ_DOF),
     ):
         for field in fields:
             found: dict[str, list[str]] = {}
             for index, value in enumerate(getattr(model, field)):
                 if not np.isfinite(value).all():
-                    found.setdefault(_shown(value), []).append(_name(model, kind, index))
+                    found.setdefault(_shown(value), []).append(_owner(model, kind, index))
             for shown, names in found.items():
                 yield (
                     f"{field} of {listed(names)} is {shown}: expected finite numbers; correct it"
                 )
+    for field, kind in (
+        *((x, _OBJ.mjOBJ_DOF) for x in DOF_FIELDS),
+        ("jnt_stiffness", _OBJ.mjOBJ_JOINT),
+    ):
+        found = {}
+        for index, value in enumerate(getattr(model, field)):
+            if value < 0:
+                found.setdefault(_shown(value), []).append(_owner(model, kind, index))
+        for shown, names in found.items():
+            yield f"{field} of {listed(names)} is {shown}: expected at least 0; correct it"
 
 
 def check_masses(model: mujoco.MjModel) -> Iterator[str]:
@@ -443,13 +466,15 @@ def check_custom(model: mujoco.MjModel) -> Iterator[str]:
     scale, speeds, keep = (
         _numeric(model, name) for name in ("action_scale", "velocity_limits", "keep_nominal")
     )
-    if scale is not None and not (scale.shape == (1,) and scale[0] > 0):
+    if scale is not None and not (scale.shape == (1,) and 0 < scale[0] < np.inf):
         yield (
             f'custom numeric "action_scale" is {_shown(scale)}: expected one number > 0 (rad); '
             'write <custom><numeric name="action_scale" data="0.3"/></custom>'
         )
     count = model.nu or int(np.sum(model.jnt_type == _JOINT.mjJNT_HINGE))
-    if speeds is not None and not (speeds.shape == (count,) and np.all(speeds > 0)):
+    if speeds is not None and not (
+        speeds.shape == (count,) and np.all((speeds > 0) & (speeds < np.inf))
+    ):
         yield (
             f'custom numeric "velocity_limits" is {_shown(speeds)}: expected {count} numbers '
             "> 0 (rad/s, one per actuator, in actuator order); write "

@@ -83,6 +83,21 @@ def test_another_file_of_the_robot_is_named(files, tmp_path, capsys):
     assert "the file of robot legs_2 is not the one" in capsys.readouterr().err
 
 
+def test_a_robot_that_the_agent_never_saw_is_named(files, tmp_path, capsys):
+    robot, agent = files
+    other = tmp_path / "other.xml"
+    other.write_text(Path(robot).read_text())
+    assert main(["design", str(other), "--agent", agent, "--method", "random"]) == 0
+    assert "was trained on legs_2, not on other" in capsys.readouterr().err
+
+
+def test_evaluate_tells_of_broken_episodes(files, capsys):
+    robot, agent = files
+    assert main(["evaluate", agent, "--robot", robot, "--episodes", "2"]) == 0
+    out = capsys.readouterr().out
+    assert "return" in out and "of 2 episodes not finite" in out
+
+
 def test_an_interrupt_is_no_traceback(monkeypatch, capsys):
     def interrupt(*args, **kwargs):
         raise KeyboardInterrupt

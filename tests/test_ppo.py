@@ -338,6 +338,27 @@ def test_a_run_continues_only_with_its_own_configuration(config, tmp_path):
     assert ppo.as_continued(config, tmp_path) == config  # a new run, with today's settings
 
 
+def test_the_default_configuration_continues_any_run(config, tmp_path, monkeypatch):
+    other = replace(config, epochs=1, policy=replace(config.policy, latent_scale=3.0))
+    trainer = ppo.Trainer(other, tmp_path)
+    trainer.start()
+    trainer.run(max_steps=config.batch, progress=False)
+    default = ppo.TrainConfig.smoke(config.robots[0], name=config.name)
+    monkeypatch.setattr(ppo.TrainConfig, "at_scale", lambda *given, **changes: default)
+    asked = []
+    monkeypatch.setattr(ppo.Trainer, "run", lambda self, *given: asked.append(self.config))
+    ppo.train(default, tmp_path, progress=False, state_only=True)
+    assert asked == [other]
+    with pytest.raises(ValueError, match="another configuration"):  # what is asked for is meant
+        ppo.train(replace(config, discount=0.9), tmp_path, progress=False, state_only=True)
+
+
+@pytest.mark.parametrize("call", [ppo.train, ppo.TrainConfig.reduced])
+def test_what_is_no_configuration_and_no_robot(call):
+    with pytest.raises(TypeError, match="expected a"):
+        call(SimpleNamespace(name="go2"))
+
+
 def test_two_runs_in_one_folder(config, tmp_path):
     trainer = ppo.Trainer(config, tmp_path)
     trainer.start()

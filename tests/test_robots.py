@@ -500,6 +500,22 @@ BAD = {
         [('name="action_scale" data="0.3"', 'name="action_scale" data="-0.3"')],
         r'"action_scale" is \[-0.3\]: expected one number',
     ),
+    "an endless velocity limit": (
+        [('data="10 11"', 'data="10 inf"')],
+        r'"velocity_limits" is \[10. inf\]: expected 2 numbers',
+    ),
+    "an endless action scale": (
+        [('name="action_scale" data="0.3"', 'name="action_scale" data="inf"')],
+        r'"action_scale" is \[inf\]: expected one number',
+    ),
+    "damping that is no number": (
+        [(RIGHT_HIP, RIGHT_HIP.replace("/>", ' damping="nan"/>'))],
+        "dof_damping of '.*' is nan: expected finite numbers",
+    ),
+    "negative damping": (
+        [(RIGHT_HIP, RIGHT_HIP.replace("/>", ' damping="-0.1"/>'))],
+        "dof_damping of '.*' is -0.1: expected at least 0",
+    ),
     "too few velocity limits": (
         [('data="10 11"', 'data="10"')],
         r'"velocity_limits" is \[10.\]: expected 2 numbers',

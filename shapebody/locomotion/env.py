@@ -15,6 +15,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from shapebody.checks import require_integer
 from shapebody.descriptions import Descriptions, Sizes, describe, kinematics
 from shapebody.design import DesignSpace, quaternion_product
 from shapebody.locomotion import episode as episodes
@@ -180,6 +181,9 @@ class Locomotion:
         robots = [require_robot(robot) for robot in robots]
         if engine not in ("auto", "native", "mjx"):
             raise ValueError(f"engine is {engine!r}; expected 'auto', 'native' or 'mjx'")
+        if not robots:
+            raise ValueError("robots is empty; expected at least one robot")
+        num_envs = require_integer("num_envs", num_envs, 1)
         if num_envs < len(robots):
             raise ValueError(f"num_envs is {num_envs}; {len(robots)} robots need at least as many")
         if engine == "auto":
@@ -254,9 +258,12 @@ class Locomotion:
             keys: one key per environment instead of `key`, to pair episodes across designs.
 
         Raises:
-            ValueError: for designs of another shape, outside [-1, 1] or not finite.
+            ValueError: for designs of another shape, outside [-1, 1] or not finite, and for a
+                coefficient outside [0, 1].
         """
         n = self.num_envs
+        if not 0 <= coefficient <= 1:
+            raise ValueError(f"coefficient is {coefficient!r}; expected a number in [0, 1]")
         if keys is None:
             keys = jax.random.split(key, n)
         coefficients = jnp.full(n, coefficient, jnp.float32)
