@@ -162,7 +162,7 @@ def _design(options):
     robot = load_robot(options.robot)
     _check_out(options.out, robot)
     agent = load_agent(options.agent or robot.name)
-    _warn_of_another_file(agent, robot)
+    _warn_of_another_robot(agent, robot)
     space = DesignSpace(robot)
     f = space.reference if options.start is None else space.start(options.start)
     found = search(
@@ -195,7 +195,7 @@ def _check_out(out, robot) -> None:
     path.absolute().parent.mkdir(parents=True, exist_ok=True)
 
 
-def _warn_of_another_file(agent, robot) -> None:
+def _warn_of_another_robot(agent, robot) -> None:
     """Say so if the robot, or its file, is not one on which the agent was trained."""
     if robot.name not in agent.robots:
         print(
@@ -238,7 +238,7 @@ def _evaluate(options):
     # Its configuration has the files of robots that are not among the shipped ones.
     trained = agent.metadata.get("config", {}).get("robots", agent.robots)
     robot = load_robot(options.robot or trained[0])
-    _warn_of_another_file(agent, robot)
+    _warn_of_another_robot(agent, robot)
     space = DesignSpace(robot)
     f = space.reference if options.start is None else space.start(options.start)
     score = evaluate(

@@ -95,7 +95,6 @@ def begin_run(
         "seconds": round(time.monotonic() - began, 1),
         "squared_error": round(error, 4),
     }
-    trainer.folder.mkdir(parents=True, exist_ok=True)
     trainer.save()
     return trainer
 

@@ -277,11 +277,17 @@ DOF_FIELDS = ("dof_damping", "dof_armature", "dof_frictionloss")
 """Properties of joints that MuJoCo keeps per degree of freedom."""
 
 
-def _owner(model, kind, index: int) -> str:
-    """Name of an object; of a degree of freedom, that of its joint."""
-    if kind == _OBJ.mjOBJ_DOF:
-        kind, index = _OBJ.mjOBJ_JOINT, model.dof_jntid[index]
-    return _name(model, kind, index)
+def _wrong(model, field: str, kind, is_wrong: Callable, expected: str) -> Iterator[str]:
+    """A message per value of a field that `is_wrong`, with the names of all that have it."""
+    found: dict[str, list[str]] = {}
+    for index, value in enumerate(getattr(model, field)):
+        if np.any(is_wrong(value)):
+            owner = (kind, index)
+            if kind == _OBJ.mjOBJ_DOF:
+                owner = (_OBJ.mjOBJ_JOINT, model.dof_jntid[index])
+            found.setdefault(_shown(value), []).append(_name(model, *owner))
+    for shown, names in found.items():
+        yield f"{field} of {listed(names)} is {shown}: expected {expected}; correct it"
 
 
 def check_numbers(model: mujoco.MjModel) -> Iterator[str]:
@@ -296,24 +302,12 @@ def check_numbers(model: mujoco.MjModel) -> Iterator[str]:
         (DOF_FIELDS, _OBJ.mjOBJ_DOF),
     ):
         for field in fields:
-            found: dict[str, list[str]] = {}
-            for index, value in enumerate(getattr(model, field)):
-                if not np.isfinite(value).all():
-                    found.setdefault(_shown(value), []).append(_owner(model, kind, index))
-            for shown, names in found.items():
-                yield (
-                    f"{field} of {listed(names)} is {shown}: expected finite numbers; correct it"
-                )
+            yield from _wrong(model, field, kind, lambda x: ~np.isfinite(x), "finite numbers")
     for field, kind in (
         *((x, _OBJ.mjOBJ_DOF) for x in DOF_FIELDS),
         ("jnt_stiffness", _OBJ.mjOBJ_JOINT),
     ):
-        found = {}
-        for index, value in enumerate(getattr(model, field)):
-            if value < 0:
-                found.setdefault(_shown(value), []).append(_owner(model, kind, index))
-        for shown, names in found.items():
-            yield f"{field} of {listed(names)} is {shown}: expected at least 0; correct it"
+        yield from _wrong(model, field, kind, lambda x: x < 0, "at least 0")
 
 
 def check_masses(model: mujoco.MjModel) -> Iterator[str]:

@@ -260,6 +260,18 @@ def test_readme_states_the_stored_results():
         )
         assert row in readme, f"README.md should have: {row}"
         assert [len(some[0]["returns"]) for some in (records, others)] == [200, 50]
+    shares = {}
+    for name in ("unitree_go2", "golem"):
+        study = experiments.stored_result(data_dir() / "results" / f"size_share_{name}.json")
+        returns = {}
+        for record in study["records"]:
+            returns.setdefault(record["kept"], []).append(np.mean(record["returns"]))
+        base, whole, size = (np.mean(returns[x]) for x in ("reference", "all", "size only"))
+        shares[name] = (size - base) / (whole - base)
+    assert (
+        "For the Go2 that is mostly the size of the body, for the Golem mostly the rest" in readme
+    )
+    assert shares["unitree_go2"] > 0.5 > shares["golem"]
     assert "over starts and episodes (200; 50 in the last column)" in readme.replace("\n", " ")
 
 
