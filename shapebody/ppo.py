@@ -187,7 +187,8 @@ class TrainConfig:
     def full(cls, robot: str, **changes) -> "TrainConfig":
         """The paper's networks and single-robot hyperparameters, for a GPU."""
         name = f"{_default_name(robot, changes)}_full"
-        return cls(**{"name": name, "robots": (robot,), **changes})
+        task = TaskConfig.ancestors()
+        return cls(**{"name": name, "robots": (robot,), "task": task, **changes})
 
     @classmethod
     def reduced(cls, robot: str, **changes) -> "TrainConfig":
@@ -993,6 +994,10 @@ def train_critic(
 ) -> Agent:
     """Policy evaluation: train a new critic for a frozen policy, at all distances from f = 0.
 
+    The task is the one that designs are evaluated on (`TaskConfig.evaluation`): every action is
+    late by one step, and the commands of small bodies are as fast as those of large ones. With
+    the task of the policy's training, a critic takes slow commands for a merit of small bodies.
+
     The agent's policy acts on designs f ~ U([-r, r]^d) with r ~ U(0, 1), with its mean actions as
     in evaluation: with exploration noise, the critic learns which bodies bear that noise, too. It
     learns TD(lambda) returns, using each step once, so that more time goes into new bodies. An
@@ -1048,7 +1053,7 @@ def train_critic(
             "num_envs": base.batch // length,
             "rollout_length": length,
             "total_steps": base.total_steps * 12 // 100 if steps is None else steps,
-            "task": replace(trained.task, horizon=200, design_radius=(0.0, 1.0)),
+            "task": TaskConfig.evaluation(horizon=200, design_radius=(0.0, 1.0)),
             **changes,
         },
     )

@@ -165,9 +165,32 @@ def test_curriculum_accelerates_and_falls_back():
         history.append(round(float(c), 3))
     assert history[:4] == [0.01, 0.03, 0.06, 0.1]
     assert history[13] == 1.0 and history[14:] == [0.99, 0.97, 0.98]
-    assert bool(curriculum.is_success(config, 0.39, 500, 1.0))
-    assert not bool(curriculum.is_success(config, 0.41, 1000, 1.0))
-    assert not bool(curriculum.is_success(config, 0.1, 499, 1.0))
+    assert bool(curriculum.is_success(config, 0.39, 500, 1.0, -5.0))
+    assert not bool(curriculum.is_success(config, 0.41, 1000, 1.0, 20.0))
+    assert not bool(curriculum.is_success(config, 0.1, 499, 1.0, 20.0))
+    # In the ancestors, a long or accurate episode is none: only its return counts.
+    ancestors = TaskConfig.ancestors()
+    assert bool(curriculum.is_success(ancestors, 0.9, 300, 1.0, 8.0))
+    assert not bool(curriculum.is_success(ancestors, 0.1, 1000, 1.0, 7.9))
+
+
+def test_the_rule_by_return_moves_c(go2):
+    """Episodes that stand still and fall short of the return lower c; with a bar of 0, they raise
+    it, however badly they track."""
+    for bar, expected in ((1e3, 0.49), (0.0, 0.51)):
+        config = TaskConfig(
+            **QUIET,
+            curriculum_success="return",
+            curriculum_return=bar,
+            curriculum_error=0.0,
+            curriculum_length=2,
+            horizon=2,
+        )
+        env = Locomotion(go2, 3, config=config, threads=1, engine="native")
+        state = env.reset(jax.random.PRNGKey(0), designs=np.zeros(358), coefficient=0.5)
+        state, trajectory = env.rollout(wave, None, state, jax.random.PRNGKey(0), 2)
+        assert np.all(trajectory.truncated[1])
+        np.testing.assert_allclose(state.coefficient, expected, rtol=1e-6)
 
 
 @pytest.mark.parametrize("engine", ["native", pytest.param("mjx", marks=pytest.mark.slow)])
@@ -214,6 +237,40 @@ def test_delay_and_clipping_of_actions(env):
     np.testing.assert_allclose(target, d.nominal + d.action_scale * 10.0, rtol=1e-6)
     with pytest.raises(ValueError, match="action_delay is 2"):
         TaskConfig(action_delay=2)
+
+
+def test_share_of_late_actions():
+    """In the ancestors only mixed episodes are late, in half of their steps: 2.5 % of all steps.
+    Ours adds half of all episodes, and the evaluation delays every action by one step."""
+    keys = jax.random.split(jax.random.PRNGKey(0), 40_000)
+
+    def share(config):
+        base, mixed = jax.vmap(lambda key: randomization.draw_delay(config, key))(keys)
+        return np.where(mixed, 0.5, base).mean()
+
+    assert share(TaskConfig.ancestors()) == pytest.approx(0.025, abs=0.003)
+    assert share(TaskConfig()) == pytest.approx(0.5, abs=0.01)
+    assert share(TaskConfig(delay_probability=1.0, mixed_delay=0.0)) == 1
+    assert share(TaskConfig.evaluation()) == 1
+
+
+@pytest.mark.parametrize("kind", ["trunk", "joint"])
+def test_too_fast_ends_an_episode(env, kind):
+    state = env.reset(jax.random.PRNGKey(0), designs=np.zeros(358), coefficient=0.0)
+    one = jax.tree.map(lambda x: jnp.asarray(np.asarray(x)[0]), state)
+    name = f"{kind}_velocity"
+
+    def ends(config, speed):
+        fast = replace(one.readings, **{name: getattr(one.readings, name).at[3].set(speed)})
+        after, outcome = episode.advance(config, one, fast)
+        return after, bool(outcome.terminated)
+
+    for speed in (101.0, -101.0):
+        after, terminated = ends(TaskConfig.ancestors(), speed)
+        assert terminated
+        assert np.abs(after.readings.trunk_velocity).max() <= 100
+        assert not ends(TaskConfig(), speed)[1]
+    assert not ends(TaskConfig.ancestors(), 99.0)[1]
 
 
 def test_nominal_start_at_zero_coefficient(env, go2):
@@ -318,7 +375,7 @@ NUMBERS = [
     field.name
     for field in fields(TaskConfig)
     if isinstance(getattr(TaskConfig(), field.name), int | float) and field.type is not bool
-] + ["command_limit", "action_delay"]
+] + ["command_limit", "action_delay", "velocity_bound"]
 
 
 @pytest.mark.parametrize("name", NUMBERS)
@@ -330,7 +387,7 @@ def test_settings_without_sense_are_named(name):
 
 def test_ranges_of_settings():
     shares = ("command_change", "command_all_zero", "command_single_zero", "mixed_delay")
-    for name in (*shares, "push_probability", "push_add"):
+    for name in (*shares, "push_probability", "push_add", "delay_probability"):
         assert getattr(TaskConfig(**{name: 1}), name) == 1
         with pytest.raises(ValueError, match=f"{name} is 1.1; expected a probability"):
             TaskConfig(**{name: 1.1})
@@ -340,6 +397,10 @@ def test_ranges_of_settings():
                 TaskConfig(**{name: wrong})
     with pytest.raises(ValueError, match="command_limit is 0"):
         TaskConfig(command_limit=0)
+    with pytest.raises(ValueError, match="velocity_bound is 0; expected a positive number"):
+        TaskConfig(velocity_bound=0)
+    with pytest.raises(ValueError, match="curriculum_success is 'length'; expected 'tracking' or"):
+        TaskConfig(curriculum_success="length")
 
 
 def test_a_broken_simulation_ends_alone(go2):

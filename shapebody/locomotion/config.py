@@ -21,7 +21,8 @@ _RANGES = {
         Real,
         0,
         1,
-        "command_change command_all_zero command_single_zero mixed_delay push_probability push_add",
+        "command_change command_all_zero command_single_zero delay_probability mixed_delay "
+        "push_probability push_add",
     ),
     "a finite number of at least 0": (
         Real,
@@ -29,7 +30,7 @@ _RANGES = {
         inf,
         "command_dead_zone noise_joint_position noise_joint_velocity noise_angular_velocity "
         "noise_gravity initial_yaw initial_tilt initial_joint_factor initial_joint_offset "
-        "push_per_mass push_limit termination_height curriculum_error",
+        "push_per_mass push_limit termination_height curriculum_error curriculum_return",
     ),
 }
 """What settings must be: in words, then their kind, their bounds and their names."""
@@ -69,8 +70,12 @@ class TaskConfig:
 
     action_delay: int | None = None
     """Control steps between action and effect: 0, 1, or None for a random delay per episode."""
+    delay_probability: float = 0.5
+    """With a random delay: probability that an episode's delay is one control step, not none. The
+    paper says "a random action delay of up to one control step"; in the ancestors it is 0, and
+    only the few episodes of `mixed_delay` have late actions, 2.5 % of all steps."""
     mixed_delay: float = 0.05
-    """With a random delay: probability that it is drawn anew in every control step."""
+    """With a random delay: probability that an episode draws 0 or 1 anew in every control step."""
 
     initial_yaw: float = pi
     """Half-width of the initial yaw, rad."""
@@ -101,15 +106,24 @@ class TaskConfig:
     """A design is drawn from U([-rc, rc]^d), with r uniform between these two. With (0, 1), bodies
     lie at every distance from the reference; with r = 1, hardly any is near it in many dimensions.
     """
+    velocity_bound: float | None = None
+    """An episode ends when a velocity of the trunk or of a joint exceeds this (m/s, rad/s), and
+    the trunk's is clipped to it; None: never. 100 in the ancestors."""
     fixed_coefficient: bool = False
     """Keep c as it was at the reset, whatever happens: for frozen policies."""
     curriculum_levels: int = 100
     """A streak of n successful episodes raises c by n over this number."""
+    curriculum_success: str = "tracking"
+    """What makes an episode a success, which raises c: "tracking", accurate for long enough, or
+    "return", the rule of the ancestors."""
     curriculum_error: float = 0.4
-    """Success needs a mean velocity error per axis of at most this x the command limit ..."""
+    """"tracking" needs a mean velocity error per axis of at most this x the command limit ..."""
     curriculum_length: int = 500
-    """... and at least this many control steps. A fall before them is a failure; an episode that is
-    cut before them without one leaves c as it is."""
+    """... and at least this many control steps. An episode that is cut before them without a fall
+    leaves c as it is, with either rule."""
+    curriculum_return: float = 8.0
+    """"return" needs at least this return of the episode, however long it was (chosen by the
+    ancestors for episodes of 1000 control steps)."""
 
     def __post_init__(self):
         if self.action_delay not in (None, 0, 1) or isinstance(self.action_delay, bool):
@@ -132,11 +146,30 @@ class TaskConfig:
                 f"command_limit is {limit!r}; expected a positive number, in m/s, or None (it "
                 "follows from the robot's dimensions)"
             )
+        bound = self.velocity_bound
+        if bound is not None and not (_is_number(bound, Real, 0, inf) and bound > 0):
+            raise ValueError(
+                f"velocity_bound is {bound!r}; expected a positive number, in m/s and rad/s, or "
+                "None (no bound)"
+            )
+        if self.curriculum_success not in ("tracking", "return"):
+            raise ValueError(
+                f"curriculum_success is {self.curriculum_success!r}; expected 'tracking' or "
+                "'return'"
+            )
         for expected, (kind, low, high, names) in _RANGES.items():
             for name in names.split():
                 value = getattr(self, name)
                 if not _is_number(value, kind, low, high):
                     raise ValueError(f"{name} is {value!r}; expected {expected}")
+
+    @classmethod
+    def ancestors(cls, **changes) -> "TaskConfig":
+        """Settings of the authors' public environment at the time of the paper, where ours differ:
+        actions are rarely late, an episode succeeds by its return, and velocities above 100 end
+        it. The paper states none of them; `full` uses them, since it takes up what matches it."""
+        named = dict(delay_probability=0.0, curriculum_success="return", velocity_bound=100.0)
+        return cls(**{**named, **changes})
 
     @classmethod
     def evaluation(cls, **changes) -> "TaskConfig":

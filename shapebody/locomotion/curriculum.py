@@ -1,6 +1,8 @@
 """The performance-based curriculum coefficient c (Appendix A, "Curriculum and design sampling").
 
-The paper refers to earlier work for the rule; this is the rule of the authors' earlier environment.
+The paper refers to earlier work for the rule; this is the rule of the authors' public environment.
+What counts as a success changed there: it was the return of the episode at the time of the paper
+(`TaskConfig.ancestors`), and is the accuracy of tracking since.
 
 Each environment has its own c. A streak of successful episodes raises it faster and
 faster, a streak of failures lowers it likewise, by streak / `curriculum_levels`. Added here:
@@ -21,12 +23,14 @@ def is_conclusive(config: TaskConfig, length, terminated):
     return terminated | (length >= config.curriculum_length)
 
 
-def is_success(config: TaskConfig, mean_error, length, command_limit):
+def is_success(config: TaskConfig, mean_error, length, command_limit, episode_return):
     """Whether an episode counts as a success.
 
     mean_error: mean over time and axes of |v_xy - c_xy|, m/s, each term at most twice the command
-    limit; length: control steps; command_limit: m/s.
+    limit; length: control steps; command_limit: m/s; episode_return: undiscounted.
     """
+    if config.curriculum_success == "return":
+        return episode_return >= config.curriculum_return
     accurate = mean_error <= config.curriculum_error * command_limit
     return accurate & (length >= config.curriculum_length)
 

@@ -30,7 +30,7 @@ RESET_SLOTS = 16
 """Finished environments are restarted in chunks of this size, so that one compiled
 function serves any number of them."""
 
-START_SETTINGS = ("horizon", "command", "initial", "action_delay", "mixed_delay")
+START_SETTINGS = ("horizon", "command", "initial", "action_delay", "delay", "mixed_delay")
 """Beginnings of the names of those fields of TaskConfig that the start of an episode depends on."""
 
 Policy = Callable[[Any, jax.Array, Descriptions, Observation], tuple[jax.Array, Any]]

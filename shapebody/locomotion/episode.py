@@ -152,6 +152,12 @@ def advance(config: TaskConfig, episode: Episode, readings: Readings):
     readings = jax.tree.map(
         lambda new, old: jnp.where(finite, new, old), readings, episode.readings
     )
+    too_fast = jnp.asarray(False)
+    if config.velocity_bound is not None:
+        bound, trunk = config.velocity_bound, readings.trunk_velocity
+        too_fast = jnp.any(jnp.abs(trunk) > bound)
+        too_fast |= jnp.any(jnp.abs(readings.joint_velocity) > bound)
+        readings = replace(readings, trunk_velocity=jnp.clip(trunk, -bound, bound))
     velocity = jnp.clip(readings.joint_velocity, -d.velocity_limits, d.velocity_limits)
     readings = replace(readings, joint_velocity=velocity, finite=finite)
     contact = observations.foot_contact(readings, d)
@@ -173,7 +179,7 @@ def advance(config: TaskConfig, episode: Episode, readings: Readings):
 
     step = episode.step + 1
     floor = (1 - episode.coefficient) * config.termination_height * d.imu_height
-    terminated = ~finite | (readings.imu_height < floor)
+    terminated = ~finite | too_fast | (readings.imu_height < floor)
     truncated = (step >= episode.horizon) & ~terminated
 
     limit = randomization.command_limit(config, d)
@@ -211,7 +217,7 @@ def next_coefficient(config: TaskConfig, episode: Episode, terminated):
         return old
     mean_error = episode.total_error / jnp.maximum(episode.step, 1)
     limit = randomization.command_limit(config, episode.descriptions)
-    success = curriculum.is_success(config, mean_error, episode.step, limit)
+    success = curriculum.is_success(config, mean_error, episode.step, limit, episode.total_reward)
     new = curriculum.update(config, *old, success)
     conclusive = curriculum.is_conclusive(config, episode.step, terminated)
     return tuple(jnp.where(conclusive, *pair) for pair in zip(new, old, strict=True))

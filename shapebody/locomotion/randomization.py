@@ -55,7 +55,7 @@ def draw_delay(config: TaskConfig, key):
     if config.action_delay is not None:
         return jnp.asarray(config.action_delay, jnp.int32), jnp.asarray(False)
     delay_key, mixed_key = jax.random.split(key)
-    delay = jax.random.bernoulli(delay_key).astype(jnp.int32)
+    delay = jax.random.bernoulli(delay_key, config.delay_probability).astype(jnp.int32)
     return delay, jax.random.uniform(mixed_key) < config.mixed_delay
 
 
