@@ -1,0 +1,122 @@
+"""Several critics of one policy, judged by what they are for: order bodies, and find better ones.
+
+The controls are the same start designs (Section 4.1), and the pull of the trust region alone.
+"""
+
+import numpy as np
+
+from shapebody.checkpoints import require_agent
+from shapebody.design import DesignSpace
+from shapebody.evaluation import EvaluationConfig, evaluate, paired_gain
+from shapebody.experiments import rank_correlation
+from shapebody.locomotion import TaskConfig
+from shapebody.search import Objective, search
+
+
+def compare_critics(
+    critics: dict,
+    robot,
+    trust_regions=(20.0, 100.0),
+    starts: int = 10,
+    first_start: int = 20,
+    episodes: int = 50,
+    horizon: int = 1000,
+    seed: int = 0,
+) -> list[dict]:
+    """VGDS with each critic and each λ, and the penalty alone, on the same episodes.
+
+    Args:
+        critics: by name, agents for `robot` with one and the same policy.
+        trust_regions: the λ.
+        starts, first_start: number of start designs, and the number of the first. The paper's are
+            0 to 9; from 20 on, none has decided about a setting here.
+        episodes, horizon, seed: of the evaluation.
+
+    Returns:
+        One record per found design: critic and trust_region (None for the penalty alone), start
+        number, the returns of all episodes, tracking error (m/s), length (control steps), the three
+        entries of f that scale the body along its axes, and the distance |f - f_ref| / sqrt(d).
+
+    Raises:
+        ValueError: if the critics belong to different policies.
+    """
+    for agent in critics.values():
+        require_agent(agent)
+    policies = {agent.policy_hash for agent in critics.values()}
+    if len(policies) != 1:
+        raise ValueError(
+            f"the critics {', '.join(critics)} belong to {len(policies)} policies; expected one, "
+            "or the returns differ for another reason"
+        )
+    space = DesignSpace(robot)
+    numbers = range(first_start, first_start + starts)
+    initial = np.stack([space.start(i) for i in numbers])
+    first = next(iter(critics.values()))
+
+    # The penalty alone asks no critic, so any agent will do.
+    found = {(None, None): search("penalty-only", first, robot, initial, seed=seed).design}
+    for name, agent in critics.items():
+        for value in trust_regions:
+            run = search("vgds", agent, robot, initial, trust_region=value, seed=seed)
+            found[name, value] = run.design
+    designs = np.concatenate(list(found.values()))
+    config = EvaluationConfig(episodes=episodes, task=TaskConfig.evaluation(horizon=horizon))
+    score = evaluate(first, robot, designs, seed=seed, config=config)
+    rows = [(*key, number) for key in found for number in numbers]
+    return [
+        {
+            "critic": name,
+            "trust_region": value,
+            "start": number,
+            "returns": [round(x, 3) for x in score.returns[i].tolist()],
+            "tracking_error": float(score.tracking_error[i].mean()),
+            "length": float(score.lengths[i].mean()),
+            "size": [round(x, 4) for x in designs[i, space.slices["size"]].tolist()],
+            "distance": float(np.sqrt(np.mean(designs[i] ** 2))),
+        }
+        for i, (name, value, number) in enumerate(rows)
+    ]
+
+
+def critic_gains(records: list[dict]) -> list[dict]:
+    """What each critic adds to the penalty alone, from the records of `compare_critics`.
+
+    Returns:
+        One row per critic and λ: mean gain in return with its 95 % interval over starts and
+        episodes (low, high), the number of starts and of those that gain, mean tracking error
+        (m/s), mean length (control steps) and mean size entries [3]; first the penalty alone,
+        whose gain is None.
+    """
+    groups: dict = {}
+    for record in records:
+        groups.setdefault((record["critic"], record["trust_region"]), []).append(record)
+    control = [record["returns"] for record in groups[None, None]]
+    rows = []
+    for (critic, value), group in groups.items():
+        row = {"critic": critic, "trust_region": value, "pairs": len(group)}
+        row |= dict.fromkeys(("mean", "low", "high", "positive"))
+        if critic is not None:
+            gain = paired_gain([record["returns"] for record in group], control)
+            positive = int(np.sum(gain.differences > 0))
+            row |= dict(mean=gain.mean, low=gain.low, high=gain.high, positive=positive)
+        for name in ("tracking_error", "length"):
+            row[name] = float(np.mean([record[name] for record in group]))
+        row["size"] = np.mean([record["size"] for record in group], axis=0).tolist()
+        rows.append(row)
+    return rows
+
+
+def critic_correlations(critics: dict, robot, records: list[dict]) -> dict[str, tuple]:
+    """Spearman's ρ of each critic's value and the return, with its 95 % interval.
+
+    Args:
+        records: of `studies.value_against_return` for the policy that all critics share; the
+            designs and the returns in them do not depend on a critic.
+    """
+    space = DesignSpace(robot)
+    designs = np.stack([space.start(record["design"]) for record in records])
+    returns = [record["return"] for record in records]
+    return {
+        name: rank_correlation(Objective.of(agent, robot, 0.0).value(designs), returns)
+        for name, agent in critics.items()
+    }
