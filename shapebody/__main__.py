@@ -48,6 +48,14 @@ def main(arguments=None) -> int:
     design.add_argument("--start", type=int, help="start design number (default: the reference)")
     design.add_argument("--seed", type=int, default=0)
     design.add_argument("--trust-region", type=float, default=100.0, help="lambda (default 100)")
+    design.add_argument(
+        "--freeze",
+        nargs="*",
+        default=["size"],
+        metavar="NAME",
+        help="parameters that stay as they are (default: size, the scale of the whole body; "
+        "alone, it frees all, as in the paper)",
+    )
     design.add_argument("--out", help="write the found body to this MJCF file")
 
     evaluate = commands.add_parser("evaluate", help="return and tracking error of an agent")
@@ -165,15 +173,19 @@ def _design(options):
     _warn_of_another_robot(agent, robot)
     space = DesignSpace(robot)
     f = space.reference if options.start is None else space.start(options.start)
+    frozen, weight = tuple(options.freeze), options.trust_region
     found = search(
-        options.method, agent, robot, f, trust_region=options.trust_region, seed=options.seed
+        options.method, agent, robot, f, trust_region=weight, seed=options.seed, frozen=frozen
     )
     print(f"{found.method}: {found.evaluations} critic evaluations, {found.seconds:.1f} s")
-    objective = Objective.of(agent, robot, options.trust_region)
+    print(f"frozen: {', '.join(frozen) or 'nothing'}")
+    objective = Objective.of(agent, robot, weight, frozen=frozen)
     print(f"objective {float(objective(f[None])[0]):.2f} -> {found.objective:.2f}")
     for label, index in space.groups.items():
         change = float(np.sqrt(np.mean(found.design[index] ** 2)))
         print(f"  {label:32s} RMS change from the reference {change:.3f}")
+    for change in space.large_changes(found.design):
+        print(f"shapebody: warning: {change}", file=sys.stderr)
     if options.out:
         print(f"wrote {atomic_write(options.out, space.to_mjcf(found.design))}")
 

@@ -286,6 +286,27 @@ class DesignSpace:
         """Labels of `groups` that are body parts."""
         return tuple(label for label in self.groups if label not in KINDS)
 
+    def frozen(self, names) -> np.ndarray:
+        """Which entries of f the names stand for, bool [d].
+
+        Args:
+            names: keys of `slices` ("size": the three factors of the whole body), labels of
+                `groups` ("Torque limit", "Trunk").
+
+        Raises:
+            ValueError: for a name that is neither; the known ones are listed.
+        """
+        chosen = np.zeros(self.dim, bool)
+        for name in (names,) if isinstance(names, str) else names:
+            known = self.slices if name in self.slices else self.groups
+            if name not in known:
+                raise ValueError(
+                    f"there are no parameters {name!r} of robot {self.robot.name!r} to be frozen; "
+                    f"known: {', '.join([*self.slices, *self.groups])}"
+                )
+            chosen[known[name]] = True
+        return chosen
+
     def _order_parts(self, labels):
         trunk = part_label(part_name(self.robot.model, "body", self.robot.trunk))
         last = {trunk: 1, "Global": 2}
@@ -299,6 +320,26 @@ class DesignSpace:
         flags are cleared: they would let MuJoCo ignore the changed frames of bodies and geoms.
         """
         return build_model(self.robot, *self._single(f))
+
+    def large_changes(self, f, limit: float = 0.25) -> list[str]:
+        """What about design f [d] makes it another machine: sentences on its total mass and on the
+        height of its trunk, where they differ from the reference by more than the part `limit`.
+
+        A critic may like a body that is cheap to move and of no use: look before you build it.
+        """
+        models = (self.to_model(self.reference), self.to_model(f))
+        sentences = []
+        for name, unit, (before, now) in (
+            ("mass", "kg", [float(np.sum(m.body_mass)) for m in models]),
+            ("height of the trunk", "m", [float(m.key_qpos[0, 2]) for m in models]),
+        ):
+            if abs(now - before) > limit * before:
+                sentences.append(
+                    f"the {name} changes from {before:.3g} to {now:.3g} {unit} "
+                    f"({now / before - 1:+.0%}): that is another robot, not a better one; "
+                    "freeze what must stay"
+                )
+        return sentences
 
     def to_mjcf(self, f) -> str:
         """MJCF text of design f [d] that compiles in any MuJoCo.

@@ -286,6 +286,37 @@ def test_search_improves_and_reports(agent, robot, starts):
     assert found.settings["states_hash"] == agent.states_hash
 
 
+@pytest.mark.parametrize("method", ["vgds", "penalty-only", "cem", "random"])
+def test_frozen_parameters_stay_at_the_reference(agent, robot, space, starts, method):
+    names = ("size", "Torque limit")
+    held = space.frozen(names)
+    assert held.sum() == 3 + robot.num_actuators and held[:3].all()
+    reference = 0.5 * space.start(7)
+    where = dict(reference=reference, frozen=names)
+    found = search(method, agent, robot, starts, **BATCH, **where, iterations=4)
+    for designs in (found.design, found.trajectory):
+        np.testing.assert_array_equal(
+            designs[..., held], np.broadcast_to(reference[held], (*designs.shape[:-1], held.sum()))
+        )
+    assert np.all(np.abs(found.trajectory[-1] - found.trajectory[0])[:, ~held].max(1) > 0)
+    assert found.settings["frozen"] == names
+    # The objective is blind for them, and knows the free ones as before.
+    objective = Objective.of(agent, robot, **where)
+    everything = Objective.of(agent, robot, reference=reference)
+    inside = np.where(held, reference, starts)
+    np.testing.assert_allclose(objective(starts), everything(inside), rtol=1e-5)
+    np.testing.assert_allclose(found.objective, everything(found.design), rtol=1e-5)
+    slope = jax.grad(lambda f: jnp.sum(objective(f)))(jnp.asarray(starts))
+    assert not np.any(slope[:, held]) and np.any(slope[:, ~held])
+
+
+def test_unknown_parameters_cannot_be_frozen(agent, robot, space):
+    assert not space.frozen(()).any()
+    np.testing.assert_array_equal(space.frozen("size"), space.frozen(("size",)))
+    with pytest.raises(ValueError, match="no parameters 'weight' of robot 'legs_2' .* known: size"):
+        search("vgds", agent, robot, space.reference, frozen=("weight",))
+
+
 def test_settings_tell_references_and_states_apart(agent, robot, space, starts):
     def settings(**changes):
         return search("vgds", agent, robot, starts, **BATCH, **changes).settings

@@ -103,6 +103,7 @@ def search(
     seed: int = 0,
     batch_size: int = 64,
     states: Observation | None = None,
+    frozen: tuple[str, ...] = (),
     **settings,
 ) -> SearchResult:
     """Search for a better design with a frozen agent (Section 3.2; baselines: Appendix C).
@@ -120,6 +121,8 @@ def search(
         seed: of the minibatches and of the method's own random numbers.
         batch_size: states per minibatch.
         states: state bank to use instead of the agent's (see `objective.bank`).
+        frozen: parameters that stay as they are in f_ref, in the starts too, such as ("size",) or
+            ("Torque limit", "Trunk"); see `DesignSpace.frozen`. None in the paper.
         **settings: fields of the method's configuration, such as iterations=50.
 
     Raises:
@@ -129,17 +132,19 @@ def search(
     """
     function, config = _method(method, settings)
     require_integer("seed", seed)
-    objective = Objective.of(agent, robot, trust_region, reference, states, batch_size)
+    objective = Objective.of(agent, robot, trust_region, reference, states, batch_size, frozen)
     starts = objective.values.space.validate(f)
     if starts.ndim > 2 or len(starts) == 0:
         raise ValueError(
             f"f has shape {starts.shape}; expected one design [{objective.dim}] or at least one "
             f"row of [S, {objective.dim}]"
         )
-    single = starts.ndim == 1
+    single, starts = starts.ndim == 1, np.asarray(objective.hold(starts))
     began, compiled = time.perf_counter(), _compilation.seconds
     found = function(objective, jnp.atleast_2d(starts), jax.random.key(seed), config)
-    found = jax.block_until_ready(found)
+    # Methods that draw designs leave noise in entries that the objective does not see.
+    held = (objective.hold(found.designs), objective.hold(found.trajectory))
+    found = jax.block_until_ready(Search(*held, found.history, found.evaluations))
     seconds = time.perf_counter() - began
     compile_seconds = min(_compilation.seconds - compiled, seconds)
     objectives = np.asarray(objective(found.designs))
@@ -162,6 +167,7 @@ def search(
             "trust_region": float(trust_region),
             "reference": None if reference is None else _short_hash(objective.reference),
             "seed": seed,
+            "frozen": tuple(frozen),
             "batch_size": objective.batch_size,
             "states": objective.num_states,
             "states_hash": _states_hash(agent, states),

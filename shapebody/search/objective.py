@@ -72,6 +72,7 @@ class Objective:
         critic: variables of the critic.
         states: the state bank, an Observation with leading axis M.
         reference: f_ref, float32 [d].
+        free: which entries of f count, bool [d]; the others are held at f_ref.
         trust_region: λ, float32 [].
         values: the critic as a function of designs and states.
         batch_size: states per minibatch.
@@ -80,6 +81,7 @@ class Objective:
     critic: Any
     states: Observation
     reference: jax.Array
+    free: jax.Array
     trust_region: jax.Array
     values: DesignCritic = field(metadata=dict(static=True))
     batch_size: int = field(default=64, metadata=dict(static=True))
@@ -93,6 +95,7 @@ class Objective:
         reference=None,
         states: Observation | None = None,
         batch_size: int = 64,
+        frozen: tuple[str, ...] = (),
     ) -> Objective:
         """The objective of an agent for a robot.
 
@@ -103,11 +106,13 @@ class Objective:
             reference: f_ref [d] in [-1, 1]; the robot as it is (f = 0) if not given.
             states: state bank to use; `bank(agent, robot)` if not given.
             batch_size: states per minibatch.
+            frozen: parameters that are held at f_ref, see `DesignSpace.frozen`.
 
         Raises:
             TypeError: for an agent or robot that is none, such as its name.
             ValueError: for a λ that is negative or not finite, a wrong reference or batch size,
-                and an agent without states that fit the robot.
+                names of parameters that are not there, and an agent without states that fit the
+                robot.
         """
         require_agent(agent)
         if not (isinstance(trust_region, numbers.Real) and 0 <= trust_region < np.inf):
@@ -129,6 +134,7 @@ class Objective:
             critic=jax.tree.map(jnp.asarray, agent.critic),
             states=jax.tree.map(lambda x: jnp.asarray(x, jnp.float32), states),
             reference=jnp.asarray(reference),
+            free=jnp.asarray(~space.frozen(frozen)),
             trust_region=jnp.asarray(trust_region, jnp.float32),
             values=values,
             batch_size=int(batch_size),
@@ -144,6 +150,10 @@ class Objective:
         """Size M of the state bank."""
         return self.states.general.shape[0]
 
+    def hold(self, designs):
+        """Designs [..., d] with the frozen entries at f_ref."""
+        return jnp.where(self.free, jnp.asarray(designs, jnp.float32), self.reference)
+
     def batch(self, key) -> Observation:
         """A minibatch of states, drawn without replacement; the whole bank if it is smaller."""
         if self.num_states <= self.batch_size:
@@ -153,14 +163,14 @@ class Objective:
 
     def value(self, designs, states: Observation | None = None):
         """Mean of V̄ over `states` (the whole bank if not given) for designs [..., d] -> [...]."""
-        designs = jnp.asarray(designs, jnp.float32)
+        designs = self.hold(designs)
         states = self.states if states is None else states
         rows = designs.reshape(-1, designs.shape[-1])
         return _mean_value(self, rows, states).reshape(designs.shape[:-1])
 
     def penalty(self, designs):
         """λ |f - f_ref|² / d for designs [..., d] -> [...]."""
-        difference = jnp.asarray(designs, jnp.float32) - self.reference
+        difference = self.hold(designs) - self.reference
         return self.trust_region * jnp.sum(difference**2, -1) / self.dim
 
     def __call__(self, designs, states: Observation | None = None):
