@@ -161,6 +161,7 @@ def _sharpen(options):
 def _design(options):
     import numpy as np
 
+    from shapebody.advice import large_changes
     from shapebody.checkpoints import load_agent
     from shapebody.design import DesignSpace
     from shapebody.files import atomic_write
@@ -184,8 +185,8 @@ def _design(options):
     for label, index in space.groups.items():
         change = float(np.sqrt(np.mean(found.design[index] ** 2)))
         print(f"  {label:32s} RMS change from the reference {change:.3f}")
-    for change in space.large_changes(found.design):
-        print(f"shapebody: warning: {change}", file=sys.stderr)
+    for change in large_changes(space, found.design):
+        print(f"shapebody: warning: another robot: {change}", file=sys.stderr)
     if options.out:
         print(f"wrote {atomic_write(options.out, space.to_mjcf(found.design))}")
 

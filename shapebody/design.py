@@ -321,26 +321,6 @@ class DesignSpace:
         """
         return build_model(self.robot, *self._single(f))
 
-    def large_changes(self, f, limit: float = 0.25) -> list[str]:
-        """What about design f [d] makes it another machine: sentences on its total mass and on the
-        height of its trunk, where they differ from the reference by more than the part `limit`.
-
-        A critic may like a body that is cheap to move and of no use: look before you build it.
-        """
-        models = (self.to_model(self.reference), self.to_model(f))
-        sentences = []
-        for name, unit, (before, now) in (
-            ("mass", "kg", [float(np.sum(m.body_mass)) for m in models]),
-            ("height of the trunk", "m", [float(m.key_qpos[0, 2]) for m in models]),
-        ):
-            if abs(now - before) > limit * before:
-                sentences.append(
-                    f"the {name} changes from {before:.3g} to {now:.3g} {unit} "
-                    f"({now / before - 1:+.0%}): that is another robot, not a better one; "
-                    "freeze what must stay"
-                )
-        return sentences
-
     def to_mjcf(self, f) -> str:
         """MJCF text of design f [d] that compiles in any MuJoCo.
 

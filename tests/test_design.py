@@ -572,15 +572,3 @@ def test_ordered_ranges():
     np.testing.assert_array_equal(ordered[0], ranges[0])
     assert np.all(ordered[:, 0] < ordered[:, 1])
     np.testing.assert_allclose(ordered.mean(axis=1), ranges.mean(axis=1))
-
-
-def test_large_changes_are_told():
-    space = DesignSpace(load_robot("unitree_go2"))
-    assert space.large_changes(space.reference) == []
-    small = np.zeros(space.dim, np.float32)
-    small[:3] = -0.5  # size factor 0.6
-    mass, height = space.large_changes(small)
-    before = load_robot("unitree_go2").model.body_mass.sum()
-    assert f"the mass changes from {before:.3g} to {before * 0.6**3:.3g} kg (-78%)" in mass
-    assert "height of the trunk" in height and "(-40%)" in height
-    assert space.large_changes(small, limit=0.5) == [mass]
