@@ -317,10 +317,10 @@ def scales_table() -> list[dict]:
     """All that differs between the scales: one record per scale, with the fields of `Budget` and
     those of `TrainConfig` that are not the same at all of them.
 
-    Beside sizes and budgets, these are three settings of training: `reduced` and `smoke`
-    standardize the networks' inputs, give the critic's targets a larger λ, and end the policy's
-    advantages where the command changes. A fourth, the softmax temperature at the start, is among
-    the networks' (`PolicyConfig`, `CriticConfig`).
+    Beside sizes and budgets, `reduced` and `smoke` differ from `full` in the number of epochs, the
+    learning rate, the critic's λ, standardized inputs, advantages that end where the command
+    changes, and the softmax temperature at the start (in `policy` and `critic`). Three settings of
+    `task` differ because `full` follows the authors' earlier environment (`TaskConfig.ancestors`).
     """
     from shapebody.ppo import TrainConfig
 

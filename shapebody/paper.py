@@ -88,7 +88,7 @@ SINGLE_ROBOT = {
         "Random": -0.9,
     },
 }
-"""ΔR by robot and method at λ = 100 (figure of Section 4.1, read off; VGDS is printed)."""
+"""ΔR by robot and method at λ = 100, read off the figure of Section 4.1 (VGDS: Appendix D)."""
 
 LAMBDAS = (0, 5, 10, 20, 50, 100, 150, 200, 300)
 TRUST_REGION = {

@@ -167,10 +167,11 @@ def agents_table(agents: Iterable):
                 f"{agent.metadata['steps'] / 1e6:.1f} million",
                 float(load_curve(agent.name)["coefficient"][-1]),
                 _policy_evaluation(agent.metadata.get("policy_evaluation")),
-                f"{agent.critic_config.latent_scale:g}",
+                f"{agent.policy_config.latent_scale:g}, {agent.critic_config.latent_scale:g}",
             )
         )
-    header = ("agent", "training steps", "c at their end", "policy evaluation", "latent scale")
+    scales = "latent scale of policy, critic"
+    header = ("agent", "training steps", "c at their end", "policy evaluation", scales)
     return table(rows, header)
 
 

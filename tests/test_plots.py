@@ -41,6 +41,9 @@ def test_agents_table():
     assert first[0] == "unitree_go2" and first[1].endswith(" million")
     assert 0 < float(second[2]) <= 1
     assert "million, " in second[3] and second[3].endswith(" actions")
+    for agent, row in zip(agents, (first, second), strict=True):
+        scales = (agent.policy_config.latent_scale, agent.critic_config.latent_scale)
+        assert row[4] == "{:g}, {:g}".format(*scales)
 
 
 def test_missing_column_is_named(curve):
