@@ -70,6 +70,22 @@ def write_inertial(body, model):
     body.fullinertia = np.full(6, np.nan)
 
 
+def keep_inertias_writable(spec, model):
+    """Let the inertias of flat bodies survive MuJoCo's writer, which rounds to six digits.
+
+    The two smaller moments of a flat body add up to the largest. Rounded, they can fall short of
+    it, and MuJoCo then refuses its own text; so they are raised by what rounding can take.
+    """
+    for body in spec.bodies[1:]:
+        if not body.explicitinertial:
+            continue
+        moments = model.body_inertia[body.id]
+        largest, margin = moments.max(), 1e-5 * moments.max()
+        if moments.sum() < 2 * largest + margin:
+            write_inertial(body, model)
+            body.inertia = np.where(moments == largest, moments, moments + margin)
+
+
 def replace_geom(spec, geom, kind, size, position, quaternion):
     """A new geom in the place of another one, with its name and looks, posed in the body frame."""
     new = geom.parent.add_geom(type=kind, size=size, pos=position, quat=quaternion)

@@ -41,7 +41,8 @@ class Report:
         return not self.problems
 
     def write(self, path: str | Path) -> Path:
-        """Write the completed MJCF file, which needs nothing inferred.
+        """Write the completed MJCF file, which needs nothing inferred and simulates in plain
+        MuJoCo as the robot does here.
 
         Raises ValueError if there are problems, and for the path of the file itself.
         """
@@ -51,7 +52,8 @@ class Report:
                 "write; correct them first"
             )
         path = Path(path)
-        if self.inferred and path.exists() and path.samefile(self.path):
+        itself = path.exists() and path.samefile(self.path)
+        if itself and path.read_bytes().decode("utf-8-sig") != self.robot.xml:
             raise ValueError(
                 f"{path} is the file itself, and the completed one has no meshes and other text: "
                 "give another name"
