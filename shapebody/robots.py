@@ -404,6 +404,13 @@ def check_feet(model: mujoco.MjModel) -> Iterator[str]:
             f'{_name(model, _OBJ.mjOBJ_BODY, 1)}, but "foot" in a name says that it is a foot: '
             "expected feet at the ends of legs that move; take the word out of these names" + also
         )
+    both = [foot for foot in feet if model.geom_group[foot] == COLLISION_GROUP]
+    if both:
+        names = [_name(model, _OBJ.mjOBJ_GEOM, foot) for foot in both]
+        yield (
+            f"{each('geom', names)} is a foot and a collision sphere of group {COLLISION_GROUP}: "
+            "expected one or the other; use another group for the foot"
+        )
     if len(feet) == 0:
         yield (
             'no geom has "foot" in its name, and no leg ends in a geom that could be a foot: '

@@ -26,6 +26,11 @@ def listed(names) -> str:
     return ", ".join(shown[:6]) + more
 
 
+def comment(text: str) -> str:
+    """An XML comment; two hyphens would end it, so a space goes between them."""
+    return f"<!-- {re.sub('-(?=-)', '- ', text)} -->"
+
+
 def each(kind: str, names) -> str:
     """Singular subject of a message about elements: "body 'a'", "each of bodies 'a', 'b'"."""
     names = list(names)

@@ -13,7 +13,7 @@ import numpy as np
 from shapebody.feet import ends_without_foot
 from shapebody.inference import FLOOR_TOLERANCE, leg_torque
 from shapebody.robots import Robot, examine, find, tilt
-from shapebody.specs import listed
+from shapebody.specs import comment, listed
 
 TILT = 15.0  # degrees of the trunk in "home" above which something is probably wrong
 RANGE_CHANGE = 0.8  # rad: in a design both limits of a joint can move towards each other by half
@@ -60,9 +60,9 @@ class Report:
             )
         from shapebody.files import atomic_write
 
-        notes = "".join(f"\n  - {note}" for note in self.inferred).replace("--", "- -")
-        comment = f"<!-- Completed from {self.path.name}:{notes}\n-->\n" if notes else ""
-        return atomic_write(path, comment + self.robot.xml)
+        notes = "".join(f"\n  - {note}" for note in self.inferred)
+        head = comment(f"Completed from {self.path.name}:{notes}\n") + "\n" if notes else ""
+        return atomic_write(path, head + self.robot.xml)
 
     def __str__(self) -> str:
         verdict = "can be used" if self.ok else "cannot be used yet"

@@ -520,6 +520,10 @@ BAD = {
         [('data="10 11"', 'data="10"')],
         r'"velocity_limits" is \[10.\]: expected 2 numbers',
     ),
+    "a foot that is a collision sphere": (
+        [('name="left_foot"', 'name="left_foot" group="5"')],
+        "geom 'left_foot' is a foot and a collision sphere of group 5: expected one",
+    ),
     "bad flags": (
         [("</custom>", '<numeric name="keep_nominal" data="0 2"/></custom>')],
         r'"keep_nominal" is \[0. 2.\]: expected 2 flags',
