@@ -11,6 +11,7 @@ import mujoco
 import numpy as np
 
 from shapebody.robots import FOOT_BOX, Robot
+from shapebody.specs import comment
 
 TIGHT_RANGE = 0.001  # rad, half width of the exported range of a joint whose limits have crossed
 _SIZES = {
@@ -109,7 +110,8 @@ def ordered_ranges(ranges) -> np.ndarray:
 
 
 def write_mjcf(robot: Robot, embodiment, scale) -> str:
-    """MJCF text of one embodiment, see `build_model`. It compiles in any MuJoCo.
+    """MJCF text of one embodiment, see `build_model`. It compiles in any MuJoCo and holds what the
+    robot's file holds for a simulation: contacts of the feet, sensors, the home pose as keyframe.
 
     The text says in a comment what MJCF could not take over: inertias that violate the triangle
     inequality are balanced (`balanced`) and crossed joint limits are tightened (`ordered_ranges`).
@@ -155,7 +157,7 @@ def write_mjcf(robot: Robot, embodiment, scale) -> str:
     ]
     if num_tightened:
         notes.append(f"Limits of {num_tightened} joints had crossed and are tight around the mean.")
-    text = f"<!-- {' '.join(notes)} -->\n{ElementTree.tostring(root, encoding='unicode')}\n"
+    text = f"{comment(' '.join(notes))}\n{ElementTree.tostring(root, encoding='unicode')}\n"
     _check(text, fields, robot)
     return text
 

@@ -20,7 +20,7 @@ from shapebody.feet import ends_without_foot, foot_ids, lowest, standing_height
 from shapebody.inference import complete
 from shapebody.paths import data_dir
 from shapebody.reading import read
-from shapebody.specs import COLLISION_GROUP, each, listed
+from shapebody.specs import COLLISION_GROUP, each, keep_inertias_writable, listed
 
 FOOT_SPHERE, FOOT_BOX = 0, 1
 PAIR_FRICTION = (1.0, 1.0, 0.005, 0.0001, 0.0001)
@@ -46,8 +46,9 @@ class Robot:
     morphology: str
     path: Path | None
     xml: str
-    """MJCF text that stands by itself: that of the file, or the completed one if anything was
-    inferred. Loaded again, it gives the same robot with nothing inferred."""
+    """MJCF text that stands by itself: that of the file, or the completed one if the file lacks
+    anything, be it only sensors, foot-floor contacts or the targets of "home". Plain MuJoCo
+    simulates it as the method does. Loaded again, it gives the same robot with nothing inferred."""
     model: mujoco.MjModel
     joints: np.ndarray
     """int[nj], MuJoCo ids of the hinge joints (all but the free joint)."""
@@ -202,14 +203,13 @@ def examine(path: Path) -> tuple[Robot | None, list[str], tuple[str, ...]]:
         return None, problems, tuple(notes)
     notes += complete(spec, model)
     if notes:
-        text = spec.to_xml()
-        spec = mujoco.MjSpec.from_string(text)
         model = spec.compile()
     problems = [message for check in (*CHECKS, check_feet, check_home) for message in check(model)]
     if problems:
         return None, problems, tuple(notes)
-    if _add_sensors(spec, model):
-        model = spec.compile()
+    # What this adds follows from the rest of the file, so it needs no note.
+    if _add_what_simulates(spec, model) or notes:
+        text, model = _written(spec)
     return _read(path.stem, path, text, model, tuple(notes)), [], tuple(notes)
 
 
@@ -404,6 +404,13 @@ def check_feet(model: mujoco.MjModel) -> Iterator[str]:
             f'{_name(model, _OBJ.mjOBJ_BODY, 1)}, but "foot" in a name says that it is a foot: '
             "expected feet at the ends of legs that move; take the word out of these names" + also
         )
+    both = [foot for foot in feet if model.geom_group[foot] == COLLISION_GROUP]
+    if both:
+        names = [_name(model, _OBJ.mjOBJ_GEOM, foot) for foot in both]
+        yield (
+            f"{each('geom', names)} is a foot and a collision sphere of group {COLLISION_GROUP}: "
+            "expected one or the other; use another group for the foot"
+        )
     if len(feet) == 0:
         yield (
             'no geom has "foot" in its name, and no leg ends in a geom that could be a foot: '
@@ -521,7 +528,7 @@ def _text(model: mujoco.MjModel, name: str, default: str) -> str:
     return bytes(model.text_data[start : start + model.text_size[index]]).decode().rstrip("\0")
 
 
-# Sensors and contact pairs.
+# What plain MuJoCo needs: sensors, contact pairs, the state "home".
 
 
 def _layout(model: mujoco.MjModel) -> dict[str, list[tuple]]:
@@ -568,29 +575,60 @@ def _slices(model: mujoco.MjModel) -> dict[str, slice] | None:
     return slices
 
 
+def _add_what_simulates(spec: mujoco.MjSpec, model: mujoco.MjModel) -> bool:
+    """Add to `spec` the missing sensors and foot-floor pairs, and let "home" be a state at rest
+    whose targets are its joint positions; says whether anything was changed.
+
+    With it, the file alone simulates in MuJoCo as the robot does here.
+    """
+    return any([_add_sensors(spec, model), _add_pairs(spec, model), _rest_home(spec, model)])
+
+
 def _add_sensors(spec: mujoco.MjSpec, model: mujoco.MjModel) -> bool:
-    """Add missing sensors and foot–floor pairs to `spec`; says whether anything was added."""
-    changed = False
-    if _slices(model) is None:
-        blocks = _layout(model)
-        ours = {sensor[0] for sensors in blocks.values() for sensor in sensors}
-        for sensor in [sensor for sensor in spec.sensors if sensor.name in ours]:
-            spec.delete(sensor)
-        for sensors in blocks.values():
-            for name, kind, owner, target in sensors:
-                spec.add_sensor(name=name, type=kind, objtype=owner, objname=target)
-        changed = True
+    if _slices(model) is not None:
+        return False
+    blocks = _layout(model)
+    ours = {sensor[0] for sensors in blocks.values() for sensor in sensors}
+    for sensor in [sensor for sensor in spec.sensors if sensor.name in ours]:
+        spec.delete(sensor)
+    for sensors in blocks.values():
+        for name, kind, owner, target in sensors:
+            spec.add_sensor(name=name, type=kind, objtype=owner, objname=target)
+    return True
+
+
+def _add_pairs(spec: mujoco.MjSpec, model: mujoco.MjModel) -> bool:
     floor = mujoco.mj_name2id(model, _OBJ.mjOBJ_GEOM, "floor")
     paired = {
         frozenset(pair)
         for pair in zip(model.pair_geom1.tolist(), model.pair_geom2.tolist(), strict=True)
     }
-    for foot in foot_ids(model):
-        if frozenset((floor, int(foot))) not in paired:
-            name = mujoco.mj_id2name(model, _OBJ.mjOBJ_GEOM, int(foot))
-            spec.add_pair(geomname1="floor", geomname2=name, condim=3, friction=PAIR_FRICTION)
-            changed = True
-    return changed
+    missing = [foot for foot in foot_ids(model) if frozenset((floor, int(foot))) not in paired]
+    for foot in missing:
+        name = mujoco.mj_id2name(model, _OBJ.mjOBJ_GEOM, int(foot))
+        spec.add_pair(geomname1="floor", geomname2=name, condim=3, friction=PAIR_FRICTION)
+    return len(missing) > 0
+
+
+def _rest_home(spec: mujoco.MjSpec, model: mujoco.MjModel) -> bool:
+    index = mujoco.mj_name2id(model, _OBJ.mjOBJ_KEY, "home")
+    targets = _home(model)[model.jnt_qposadr[model.actuator_trnid[:, 0]]]
+    if (
+        np.array_equal(model.key_ctrl[index], targets)
+        and not model.key_qvel[index].any()
+        and model.key_time[index] == 0
+    ):
+        return False
+    key = spec.key("home")
+    key.time, key.qvel, key.ctrl = 0, np.zeros(model.nv), targets
+    return True
+
+
+def _written(spec: mujoco.MjSpec) -> tuple[str, mujoco.MjModel]:
+    """Text of `spec`, and the model that this text compiles to, to the last digit."""
+    keep_inertias_writable(spec, spec.compile())
+    text = spec.to_xml()
+    return text, mujoco.MjModel.from_xml_string(text)
 
 
 def _read(name: str, path: Path | None, xml: str, model: mujoco.MjModel, inferred) -> Robot:

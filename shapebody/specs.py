@@ -26,6 +26,11 @@ def listed(names) -> str:
     return ", ".join(shown[:6]) + more
 
 
+def comment(text: str) -> str:
+    """An XML comment; two hyphens would end it, so a space goes between them."""
+    return f"<!-- {re.sub('-(?=-)', '- ', text)} -->"
+
+
 def each(kind: str, names) -> str:
     """Singular subject of a message about elements: "body 'a'", "each of bodies 'a', 'b'"."""
     names = list(names)
@@ -68,6 +73,22 @@ def write_inertial(body, model):
     body.iquat = model.body_iquat[body.id]
     body.inertia = model.body_inertia[body.id]
     body.fullinertia = np.full(6, np.nan)
+
+
+def keep_inertias_writable(spec, model):
+    """Let the inertias of flat bodies survive MuJoCo's writer, which rounds to six digits.
+
+    The two smaller moments of a flat body add up to the largest. Rounded, they can fall short of
+    it, and MuJoCo then refuses its own text; so they are raised by what rounding can take.
+    """
+    for body in spec.bodies[1:]:
+        if not body.explicitinertial:
+            continue
+        moments = model.body_inertia[body.id]
+        largest, margin = moments.max(), 1e-5 * moments.max()
+        if moments.sum() < 2 * largest + margin:
+            write_inertial(body, model)
+            body.inertia = np.where(moments == largest, moments, moments + margin)
 
 
 def replace_geom(spec, geom, kind, size, position, quaternion):

@@ -13,7 +13,7 @@ import numpy as np
 from shapebody.feet import ends_without_foot
 from shapebody.inference import FLOOR_TOLERANCE, leg_torque
 from shapebody.robots import Robot, examine, find, tilt
-from shapebody.specs import listed
+from shapebody.specs import comment, listed
 
 TILT = 15.0  # degrees of the trunk in "home" above which something is probably wrong
 RANGE_CHANGE = 0.8  # rad: in a design both limits of a joint can move towards each other by half
@@ -41,7 +41,8 @@ class Report:
         return not self.problems
 
     def write(self, path: str | Path) -> Path:
-        """Write the completed MJCF file, which needs nothing inferred.
+        """Write the completed MJCF file, which needs nothing inferred and simulates in plain
+        MuJoCo as the robot does here.
 
         Raises ValueError if there are problems, and for the path of the file itself.
         """
@@ -51,16 +52,17 @@ class Report:
                 "write; correct them first"
             )
         path = Path(path)
-        if self.inferred and path.exists() and path.samefile(self.path):
+        itself = path.exists() and path.samefile(self.path)
+        if itself and path.read_bytes().decode("utf-8-sig") != self.robot.xml:
             raise ValueError(
                 f"{path} is the file itself, and the completed one has no meshes and other text: "
                 "give another name"
             )
         from shapebody.files import atomic_write
 
-        notes = "".join(f"\n  - {note}" for note in self.inferred).replace("--", "- -")
-        comment = f"<!-- Completed from {self.path.name}:{notes}\n-->\n" if notes else ""
-        return atomic_write(path, comment + self.robot.xml)
+        notes = "".join(f"\n  - {note}" for note in self.inferred)
+        head = comment(f"Completed from {self.path.name}:{notes}\n") + "\n" if notes else ""
+        return atomic_write(path, head + self.robot.xml)
 
     def __str__(self) -> str:
         verdict = "can be used" if self.ok else "cannot be used yet"

@@ -75,7 +75,7 @@ def test_another_file_of_the_robot_is_named(files, tmp_path, capsys):
     own = replace(own, metadata=own.metadata | {"phases": phases})
     folder = str(save_agent(own, tmp_path / "agent"))
     changed = tmp_path / "legs_2.xml"
-    changed.write_text(Path(robot).read_text() + "\n")
+    changed.write_text(Path(robot).read_text().replace('mass="2"', 'mass="2.1"'))
     options = ["--agent", folder, "--method", "random"]
     assert main(["design", robot, *options]) == 0
     assert not capsys.readouterr().err

@@ -308,7 +308,7 @@ def own_robot(folder: Path, *changes: tuple[str, str]) -> Path:
 def test_sensors_and_pairs_are_added_to_a_plain_file(tmp_path):
     path = own_robot(tmp_path)
     robot = load_robot(str(path))
-    assert robot.path == path and robot.xml == OWN and robot.inferred == ()
+    assert robot.path == path and robot.inferred == ()
     assert (robot.name, robot.display_name, robot.morphology) == ("own", "Own", "biped")
     assert robot.design_dim == 9 + 13 * 3 + 11 * 2 + 3 * 2 + 3 * 2
     np.testing.assert_array_equal(robot.actuated, [1, 0])
@@ -519,6 +519,10 @@ BAD = {
     "too few velocity limits": (
         [('data="10 11"', 'data="10"')],
         r'"velocity_limits" is \[10.\]: expected 2 numbers',
+    ),
+    "a foot that is a collision sphere": (
+        [('name="left_foot"', 'name="left_foot" group="5"')],
+        "geom 'left_foot' is a foot and a collision sphere of group 5: expected one",
     ),
     "bad flags": (
         [("</custom>", '<numeric name="keep_nominal" data="0 2"/></custom>')],
