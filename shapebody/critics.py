@@ -8,9 +8,10 @@ import numpy as np
 from shapebody.checkpoints import require_agent
 from shapebody.design import DesignSpace
 from shapebody.evaluation import EvaluationConfig, evaluate, paired_gain
-from shapebody.experiments import rank_correlation
+from shapebody.experiments import rank_correlation, result, result_in_parts
 from shapebody.locomotion import TaskConfig
 from shapebody.search import Objective, search
+from shapebody.studies import value_against_return
 
 
 def compare_critics(
@@ -120,3 +121,40 @@ def critic_correlations(critics: dict, robot, records: list[dict]) -> dict[str, 
         name: rank_correlation(Objective.of(agent, robot, 0.0).value(designs), returns)
         for name, agent in critics.items()
     }
+
+
+def critic_tasks(old, new, robot, **changes) -> dict:
+    """Is a critic better that was trained on the task on which designs are evaluated?
+
+    data/results/critic_tasks_<robot>.json is this with `new`, the shipped agent, and `old`, the one
+    shipped before it (in the history of this repository, commit 1568810), whose critic was trained
+    as long on the task of the policy's training. It is `train_critic(new, CriticConfig.sharp(),
+    6_000_000, task=replace(task, horizon=200, design_radius=(0.0, 1.0)))` with the `task` of
+    `new.metadata["config"]`.
+
+    Args:
+        changes: settings of `compare_critics`.
+
+    Returns:
+        {"records": ..., "provenance": ...} with the records of `compare_critics`, and one of each
+        critic's rank correlation over 256 random designs: critic, rho, low, high.
+    """
+    critics = {"task of the training": old, "task of the evaluation": new}
+    setting = {"starts": 10, "first_start": 30, "episodes": 50, "horizon": 1000, **changes}
+    values = {"designs": 256, "episodes": 8, "horizon": setting["horizon"]}
+
+    def correlations():
+        name = f"value_against_return_{robot.name}"
+        random = result(name, lambda: value_against_return(new, robot, **values), new, **values)
+        found = critic_correlations(critics, robot, random["records"])
+        return [
+            {"critic": name, "rho": rho, "low": low, "high": high}
+            for name, (rho, low, high) in found.items()
+        ]
+
+    parts = {
+        "found designs": lambda: compare_critics(critics, robot, **setting),
+        "rank correlation": correlations,
+    }
+    name = f"critic_tasks_{robot.name}"
+    return result_in_parts(name, parts, new, **setting, old=old.hash)

@@ -68,3 +68,18 @@ def test_another_policy_is_refused(pair, robot):
     stranger = replace(pair["one"], policy=jax.tree.map(lambda x: x + 1, pair["one"].policy))
     with pytest.raises(ValueError, match="one, stranger belong to 2 policies; expected one"):
         critics.compare_critics({"one": pair["one"], "stranger": stranger}, robot, **SETTING)
+
+
+def test_two_tasks_are_compared_and_kept(pair, robot, tmp_path, monkeypatch):
+    monkeypatch.setenv("SHAPEBODY_DATA", str(tmp_path))
+    monkeypatch.setenv("SHAPEBODY_SCALE", "reduced")
+    short = dict(starts=2, episodes=2, horizon=3)
+    study = critics.critic_tasks(pair["one"], pair["other"], robot, **short)
+    assert len(study["records"]) == 2 + 2 * 2 * 2 + 2
+    assert {r["critic"] for r in study["records"]} == {
+        None,
+        "task of the training",
+        "task of the evaluation",
+    }
+    monkeypatch.setattr(critics, "search", None)
+    assert critics.critic_tasks(pair["one"], pair["other"], robot, **short) == study
