@@ -140,7 +140,7 @@ def warn_standing(robot: Robot, held: Held) -> Iterator[str]:
             f"high for the smallest inertias{named} (kp {robot.p_gain:g}, kv {robot.d_gain:g}); "
             f"lower them, or add armature to the joints: {_advised_armature(robot)} is enough"
         )
-    elif held.fell:
+    elif held.fell and leg_drop(robot) >= FLAT:  # what lies cannot fall
         if held.sunk > 1:
             cause = (
                 "Only its feet touch the floor, so it fell over and the trunk went through: see "

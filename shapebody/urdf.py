@@ -75,9 +75,10 @@ def _check_base(path: Path, root):
 
 
 def _check_inertias(root) -> tuple[list[str], list[str]]:
-    """Notes and problems about inertias of links that are not positive definite.
+    """Notes and problems about inertias that no body has.
 
-    They are left out, so they are a problem where a moving part has no other.
+    Those that are not positive definite are left out, which is a problem where a moving part has
+    no other. Those with one principal moment above the sum of the others are made equal.
     """
     links = {link.get("name"): link for link in root.findall("link")}
     part = {name: name for name in links}  # the first link of what moves as one
@@ -91,7 +92,7 @@ def _check_inertias(root) -> tuple[list[str], list[str]]:
         while part[name] in fixed and part[name] not in seen:
             seen.add(part[name])
             part[name] = fixed[part[name]]
-    wrong, right = {}, set()
+    wrong, uneven, right = {}, [], set()
     for name, link in links.items():
         inertia = link.find("inertial/inertia")
         if inertia is None:
@@ -102,9 +103,12 @@ def _check_inertias(root) -> tuple[list[str], list[str]]:
         tensor = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
         if not is_finite(tensor).all() or not tensor.any():
             continue  # reported as such
-        least = np.linalg.eigvalsh(tensor)[0]
+        least, middle, most = np.linalg.eigvalsh(tensor)
         if least > 1e-12:
             right.add(part[name])
+            if most - middle - least > 1e-12 * most:
+                mean = (least + middle + most) / 3
+                uneven.append(f"{name!r} ({least:.3g}, {middle:.3g}, {most:.3g}, now {mean:.3g})")
         else:
             wrong[name] = f"{name!r} (its smallest principal moment is {least:.3g} kg m²)"
     lone = [text for name, text in wrong.items() if part[name] not in right]
@@ -113,11 +117,19 @@ def _check_inertias(root) -> tuple[list[str], list[str]]:
         f"inertia of {each('link', lone)} is not positive definite, which no body has: correct "
         "ixx to izz, e.g. by those of a box of the same mass and size"
     ]
-    notes = [
-        f"inertia of {each('link', merged)} is not positive definite, which no body has: it is "
-        "left out, and what moves as one with it has the inertia of the other links"
-    ]
-    return notes if merged else [], problems if lone else []
+    notes = []
+    if merged:
+        notes.append(
+            f"inertia of {each('link', merged)} is not positive definite, which no body has: it is "
+            "left out, and what moves as one with it has the inertia of the other links"
+        )
+    if uneven:
+        notes.append(
+            f"inertia of {each('link', uneven)} has a principal moment above the sum of the "
+            "others, which no body has: it is replaced by three equal ones of the same sum (kg "
+            "m²); to say it yourself correct ixx to izz"
+        )
+    return notes, problems if lone else []
 
 
 def end(joint, kind: str) -> str | None:
