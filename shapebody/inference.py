@@ -27,7 +27,7 @@ from shapebody.feet import (
     solid,
     standing_height,
 )
-from shapebody.reading import IMU, VELOCITY_LIMIT
+from shapebody.reading import ARMATURE, IMU, VELOCITY_LIMIT
 from shapebody.specs import (
     COLLISION_GROUP,
     FOOT,
@@ -44,6 +44,9 @@ from shapebody.specs import (
     write_inertial,
 )
 
+GAIN_PER_MASS = 1.5  # N m/rad per kg; the median of the 50 robots is 1.6
+GAIN_RANGE = 20.0, 80.0  # N m/rad
+GAIN_RATIO = 40.0  # 1/s, P over D gain
 FLOOR_TOLERANCE = 0.05  # of the home height: how far feet may be from the floor
 
 _GEOM, _JOINT, _TRN = mujoco.mjtGeom, mujoco.mjtJoint, mujoco.mjtTrn
@@ -118,7 +121,10 @@ _STANDING = re.compile("home|stand|nominal|default|init", re.IGNORECASE)
 
 
 def infer_home(spec, model) -> Iterator[str]:
-    """Keyframe "home": another keyframe, or all joints as near to zero as their limits allow."""
+    """Keyframe "home": another keyframe, or the pose in which the file is drawn.
+
+    There all joints are at zero, or at their `ref`; or as near to it as their limits allow.
+    """
     if any(key.name == "home" for key in spec.keys):
         return
     hint = (
@@ -131,7 +137,7 @@ def infer_home(spec, model) -> Iterator[str]:
         note = f"the nominal pose is that of keyframe {named[0].name!r}"
     else:
         qpos, moved = _near_zero(model)
-        note = "the nominal pose has all joints at zero"
+        note = _drawn(model)
         if moved:
             note += (
                 f", but {listed(moved)} at the nearest position within their limits, and the "
@@ -141,6 +147,21 @@ def infer_home(spec, model) -> Iterator[str]:
         spec.delete(key)
     spec.add_key(name="home", qpos=qpos)
     yield f'no keyframe "home": {note}; {hint}'
+
+
+def _drawn(model) -> str:
+    """The pose in which a file is drawn, for a note: zero, or what `ref` says."""
+    hinges = np.flatnonzero(model.jnt_type == _JOINT.mjJNT_HINGE)
+    angles = model.qpos0[model.jnt_qposadr[hinges]]
+    names: dict[str, list[str]] = {}
+    for joint, angle in zip(hinges, angles, strict=True):
+        if angle:
+            names.setdefault(f"{angle:.3g}", []).append(model.joint(int(joint)).name)
+    if not names:
+        return "the nominal pose has all joints at zero"
+    places = "; ".join(f"{listed(group)} at {angle} rad" for angle, group in names.items())
+    rest = "" if np.all(angles) else ", the others at zero"
+    return f"the nominal pose is the one that is drawn, with joints at their ref: {places}{rest}"
 
 
 def _near_zero(model) -> tuple[np.ndarray, list[str]]:
@@ -276,7 +297,9 @@ def infer_actuators(spec, model) -> Iterator[str]:
 
     P and D gain are the medians of the file's position servos. Without any, P is 1.5 N m/rad per
     kg of the robot, within 20 and 80, and D = P / 40: for the 50 robots of the paper P is within a
-    factor 1.5 of the paper's for 92 %, D within a factor 2 for all (1.5 for 84 %).
+    factor 1.5 of the paper's for 92 %, D within a factor 2 for all (1.5 for 84 %). Gains that the
+    file does not give need inertia at the joint: where it has no armature either, it gets that of
+    a URDF.
     Without a torque limit in the file (of the actuator, of its control range or of the joint) it is
     `leg_torque`.
     """
@@ -316,22 +339,21 @@ def infer_actuators(spec, model) -> Iterator[str]:
             "servos, the form of control of the method; to say it yourself use <position>"
         )
 
-    if len(gains):
-        p_gain, d_gain = np.median(gains, axis=0)
-        different = np.unique(gains, axis=0)
-        if len(different) > 1:
-            listing = ", ".join(f"{p:g}/{d:g}" for p, d in different)
-            yield (
-                f"{len(different)} different kp/kv ({listing}): the method has one pair for the "
-                f"whole robot, the median {p_gain:g}/{d_gain:g}; to say it yourself use the same "
-                "kp and kv everywhere"
-            )
-    else:
-        p_gain = float(np.round(np.clip(1.5 * model.body_mass[1:].sum(), 20, 80)))
-        d_gain = p_gain / 40
+    (p_gain, d_gain), note = _chosen_gains(model, gains)
+    if note:
+        yield note
+    light = [
+        int(driven[i])
+        for i in range(len(driven))
+        if not (model.nu and servos[i]) and model.dof_armature[model.jnt_dofadr[driven[i]]] == 0
+    ]
+    if light:
+        for joint in light:
+            joints[joint].armature = ARMATURE
         yield (
-            f"no gains: kp = {p_gain:g} N m/rad and kv = {d_gain:g} N m s/rad from the mass of "
-            f"{model.body_mass[1:].sum():.3g} kg; to say it yourself give them in <position>"
+            f"no armature of joints {listed(model.joint(j).name for j in light)}: {ARMATURE:g} kg "
+            "m², the inertia of a motor as the joint feels it; to say it yourself add "
+            f'armature="{ARMATURE:g}" to the joints'
         )
 
     missing = [int(driven[i]) for i, limit in enumerate(limits) if limit is None]
@@ -352,12 +374,14 @@ def infer_actuators(spec, model) -> Iterator[str]:
             "multiplied into torque limits and gains, which are those of the joint"
         )
     low, high = model.actuator_forcerange.T
-    uneven = [i for i in np.flatnonzero(model.actuator_forcelimited) if -low[i] != high[i]]
-    if uneven:
-        yield (
-            f"torque limits of {listed([_actuator_name(model, i) for i in uneven])} are not "
-            "symmetric: the smaller one holds in both directions"
-        )
+    uneven = (low != -high) & (model.actuator_forcelimited == 1)
+    for found, rule in (
+        (uneven & (low < 0), "are not symmetric: the smaller one holds in both directions"),
+        (uneven & (low == 0), "are of one direction: the same is assumed for the other"),
+    ):
+        if found.any():
+            names = listed(_actuator_name(model, i) for i in np.flatnonzero(found))
+            yield f"torque limits of {names} {rule}"
     if np.any(model.jnt_actfrclimited[driven]):
         yield "torque limits of the joints (actuatorfrcrange, effort) are moved to the actuators"
 
@@ -369,6 +393,35 @@ def infer_actuators(spec, model) -> Iterator[str]:
     key = spec.key("home")
     key.act = []
     key.ctrl = home[model.jnt_qposadr[driven]]
+
+
+def _chosen_gains(model, gains) -> tuple[tuple[float, float], str]:
+    """P and D gain of all servos from those of the file [n, 2], and a note if they differ."""
+    different = np.unique(gains, axis=0)
+    if len(different):
+        p_gain, d_gain = np.median(gains, axis=0)
+        if len(different) == 1:
+            return (p_gain, d_gain), ""
+        listing = ", ".join(f"{p:g}/{d:g}" for p, d in different)
+        return (p_gain, d_gain), (
+            f"{len(different)} different kp/kv ({listing}): the method has one pair for the whole "
+            f"robot, the median {p_gain:g}/{d_gain:g}; to say it yourself use the same kp and kv "
+            "everywhere"
+        )
+    mass = model.body_mass[1:].sum()
+    usual = GAIN_PER_MASS * mass
+    p_gain = float(np.round(np.clip(usual, *GAIN_RANGE)))
+    d_gain = p_gain / GAIN_RATIO
+    capped = ""
+    if usual > GAIN_RANGE[1]:
+        capped = (
+            f" ({GAIN_PER_MASS:g} N m/rad per kg would be {usual:.0f}, but no more than "
+            f"{GAIN_RANGE[1]:g} is inferred, as most heavy robots of the paper have it)"
+        )
+    return (p_gain, d_gain), (
+        f"no gains: kp = {p_gain:g} N m/rad and kv = {d_gain:g} N m s/rad from the mass of "
+        f"{mass:.3g} kg{capped}; to say it yourself give them in <position>"
+    )
 
 
 def _is_servo(model, i) -> bool:

@@ -6,24 +6,28 @@ velocity limits and feet from its own elements.
 
 import re
 import xml.etree.ElementTree as ElementTree
-from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
 
 import mujoco
 import numpy as np
 
+from shapebody.finite import written
 from shapebody.specs import (
     FOOT,
     MESHES,
     add_floor,
     drop_assets,
     drop_geom,
+    each,
     listed,
     name_parts,
     ordered,
     unused,
 )
+from shapebody.urdf import check_urdf, limits_of
+from shapebody.urdf import end as _end
+from shapebody.urdf import number as _number
 
 VELOCITY_LIMIT = 15.0  # rad/s, the median over the 50 robots of their median joint
 ARMATURE = 0.01  # kg m², the median of the 50 robots; 76 % are within a factor 2
@@ -72,7 +76,8 @@ def read(path: Path) -> tuple[str, mujoco.MjSpec, mujoco.MjModel, list[str]]:
             model = _float(spec, model, text, notes)
     except ValueError as error:
         kind = "URDF" if urdf else "MJCF"
-        raise ValueError(f"{path} is not a valid {kind} file: {_explained(error)}") from error
+        reason = _explained(error, kind, text)
+        raise ValueError(f"{path} is not a valid {kind} file: {reason}") from error
     if re.search(r"<include\s", text):
         notes.append("other files are included: their text is merged into the completed file")
     return text, spec, model, notes
@@ -84,8 +89,8 @@ _FIXES = {
     "qpos size": "give each keyframe as many numbers as the robot has positions (7 for the free "
     "joint, then 1 per hinge); if it has them, the trunk lacks its <freejoint/>",
     "balanceinertia": 'correct the inertia, or let <compiler balanceinertia="true"/> repair it',
-    "top level": "the base floats by itself: remove the link above the floating joint, and the "
-    "joint; between links that move give the joint type revolute",
+    "positive eigenvalues": "an inertia must be positive definite: no body has one that is not; "
+    "correct the numbers, e.g. by those of a box of the same mass and size",
     "opening file": "put the included file where the text says; a file that includes others must "
     "have a name that ends in '.xml'",
     "model type": "expected <mujoco> (MJCF) or <robot> (URDF) as the first element: this is "
@@ -96,10 +101,24 @@ _FIXES = {
 }
 
 
-def _explained(error: Exception) -> str:
+_TOP_LEVEL = {
+    "URDF": "the base floats by itself: remove the link above the floating joint, and the joint; "
+    "between links that move give the joint type revolute",
+    "MJCF": "a <freejoint/> belongs to a body directly in <worldbody>: take the body out of the "
+    "one around it, or move the <freejoint/> to the outermost body",
+}
+
+
+def _explained(error: Exception, kind: str, text: str) -> str:
+    """What MuJoCo reports about a file of a kind ("URDF" or "MJCF"), and the fix."""
     reason = " ".join(str(error).split())
     default = "correct the reported element"
-    fix = next((fix for part, fix in _FIXES.items() if part in reason), default)
+    fixes = {**_FIXES, "top level": _TOP_LEVEL[kind]}
+    fix = next((fix for part, fix in fixes.items() if part in reason), default)
+    root = _urdf_root(text)
+    wrong = [] if root is None else written(root)
+    if wrong:
+        fix = f"expected finite numbers, but {listed(wrong)}; correct them"
     return f"MuJoCo reports {reason!r}. {fix[0].upper()}{fix[1:]}"
 
 
@@ -149,7 +168,7 @@ def _prepared_urdf(path: Path, text: str, notes) -> str:
     root = _urdf_root(text)
     if root is None:
         return text
-    _check_urdf(path, root)
+    notes += check_urdf(path, root)
     dropped = []
     while (link := _empty_root(root)) is not None:
         (joint,) = [joint for joint in root.findall("joint") if _end(joint, "parent") == link]
@@ -168,43 +187,12 @@ def _prepared_urdf(path: Path, text: str, notes) -> str:
     return ElementTree.tostring(root, encoding="unicode")
 
 
-def _check_urdf(path: Path, root):
-    """Raises ValueError for what MuJoCo's importer does not notice."""
-    repeated = [
-        f"repeated name {name!r} in {kind} ({count} of them)"
-        for kind in ("link", "joint")
-        for name, count in Counter(part.get("name") for part in root.findall(kind)).items()
-        if name and count > 1
-    ]
-    wrong: dict[str, list[str]] = {}
-    for joint, velocity in _urdf_velocities(root):
-        if not np.isfinite(_number(velocity)):
-            wrong.setdefault(velocity, []).append(repr(joint))
-    reasons = []
-    if repeated:
-        reasons.append(f"{listed(repeated)}. {_FIXES['repeated name'].capitalize()}")
-    for velocity, joints in wrong.items():
-        reasons.append(
-            f"velocity of {'joint' if len(joints) == 1 else 'joints'} {listed(joints)} is "
-            f"{velocity!r}: expected a number (rad/s); write it, or expand the xacro template that "
-            "the file comes from"
-        )
-    if reasons:
-        raise ValueError(f"{path} is not a valid URDF file: {'; '.join(reasons)}")
-
-
 def _urdf_root(text: str):
     """Root element of a URDF; None if MuJoCo's more lenient parser has to read it alone."""
     try:
         return ElementTree.fromstring(text)
     except ElementTree.ParseError:
         return None
-
-
-def _end(joint, kind: str) -> str | None:
-    """Name of the "parent" or "child" link of a URDF joint."""
-    element = joint.find(kind)
-    return None if element is None else element.get("link")
 
 
 def _empty_root(root) -> str | None:
@@ -227,14 +215,6 @@ def _empty_root(root) -> str | None:
     ):
         return None
     return tops[0].get("name")
-
-
-def _number(text: str) -> float:
-    """The number that a text is; NaN if it is none."""
-    try:
-        return float(text)
-    except ValueError:
-        return float("nan")
 
 
 def _import_urdf(path: Path, text: str, notes) -> mujoco.MjSpec:
@@ -314,16 +294,45 @@ def _float(spec, model, text, notes) -> mujoco.MjModel:
             "as the joint feels it; to say it yourself write the completed file and edit <joint "
             'armature="..."/>'
         )
-    model = _compile(spec, notes)
+    _apply_limits(spec, text, notes)
+    return _compile(spec, notes)
+
+
+def _apply_limits(spec, text, notes):
+    """Efforts that mean nothing are dropped; velocities, which the importer drops, are added."""
     root = _urdf_root(text)
-    speeds = {} if root is None else {name: float(v) for name, v in _urdf_velocities(root)}
-    speeds = {name: speed for name, speed in speeds.items() if speed > 0}
-    hinges = [joint.name for joint in ordered(spec.joints) if joint.type == _JOINT.mjJNT_HINGE]
-    if any(name in speeds for name in hinges):
-        data = [speeds.get(name, VELOCITY_LIMIT) for name in hinges]
+    if root is None:
+        return
+    hinges = [joint for joint in ordered(spec.joints) if joint.type == _JOINT.mjJNT_HINGE]
+    missing: dict[tuple[str, str], list[str]] = {}
+
+    def given(attribute, name, values):
+        if _number(values.get(name, "0")) > 0:
+            return True
+        value = "is missing" if name not in values else f"is {values[name]}"
+        missing.setdefault((attribute, value), []).append(name)
+        return False
+
+    efforts, speeds = (dict(limits_of(root, name)) for name in ("effort", "velocity"))
+    data = []
+    for joint in hinges:
+        if not given("effort", joint.name, efforts):
+            joint.actfrclimited = mujoco.mjtLimited.mjLIMITED_FALSE
+            joint.actfrcrange = [0, 0]
+        known = given("velocity", joint.name, speeds)
+        data.append(float(speeds[joint.name]) if known else VELOCITY_LIMIT)
+    if hinges:
         spec.add_numeric(name="velocity_limits", data=data, size=len(data))
-        model = _compile(spec, notes)
-    return model
+    instead = {
+        "effort": "which limits no torque: the weight on one foot times the length of a leg is "
+        "used instead, as in the note on torque limits",
+        "velocity": f"which limits no velocity: {VELOCITY_LIMIT:g} rad/s is used instead",
+    }
+    notes += [
+        f"{attribute} of {each('joint', names)} {value}, {instead[attribute]}; to say it yourself "
+        f"correct {attribute} in <limit>"
+        for (attribute, value), names in missing.items()
+    ]
 
 
 _FOOT_LINK = re.compile(r"foot(_?link|_?frame)?(_?\d+|_[lr])?$", re.IGNORECASE)
@@ -359,11 +368,3 @@ def _feet_of_links(spec, fixed) -> Iterator[str]:
             "at the origin of the link with a radius of 4 % of the leg; to say it yourself give "
             "the link a <collision> with a sphere or a box"
         )
-
-
-def _urdf_velocities(root) -> Iterator[tuple[str, str]]:
-    """Joints and the texts of their velocity limits; MuJoCo's importer has no place for them."""
-    for joint in root.findall("joint"):
-        limit = joint.find("limit")
-        if limit is not None and limit.get("velocity") is not None:
-            yield joint.get("name"), limit.get("velocity")

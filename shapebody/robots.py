@@ -17,6 +17,7 @@ import numpy as np
 
 from shapebody.checks import require_kind
 from shapebody.feet import ends_without_foot, foot_ids, lowest, standing_height
+from shapebody.finite import check_inertials, check_numbers, check_text, is_finite
 from shapebody.inference import complete
 from shapebody.paths import data_dir
 from shapebody.reading import read
@@ -198,7 +199,10 @@ def examine(path: Path) -> tuple[Robot | None, list[str], tuple[str, ...]]:
     Raises ValueError for a file that MuJoCo cannot compile.
     """
     text, spec, model, notes = read(path)
-    problems = [message for check in CHECKS for message in check(model)]
+    replaced = list(check_inertials(spec, model))
+    checks = [check for check in CHECKS if not (replaced and check is check_masses)]
+    problems = replaced + [message for check in checks for message in check(model)]
+    problems = problems or list(check_text(text))
     if problems:
         return None, problems, tuple(notes)
     notes += complete(spec, model)
@@ -221,9 +225,12 @@ def check_tree(model: mujoco.MjModel) -> Iterator[str]:
     """One floating body; every other body hangs from it."""
     free = np.flatnonzero(model.jnt_type == _JOINT.mjJNT_FREE)
     if len(free) == 0:
+        base = f" {_name(model, _OBJ.mjOBJ_BODY, 1)}" if model.nbody > 1 else ""
         yield (
-            "no free joint: expected exactly one, in the trunk; "
-            "add <freejoint/> to the first body of the worldbody"
+            f"no free joint: expected exactly one, in the trunk; the file fixes the base{base} to "
+            "the world, as that of an arm on a table, which cannot be used. If the robot walks, "
+            "add <freejoint/> to the first body of the worldbody (in a URDF, make the link of the "
+            "trunk the root)"
         )
     elif len(free) > 1:
         bodies = ", ".join(_name(model, _OBJ.mjOBJ_BODY, model.jnt_bodyid[j]) for j in free)
@@ -273,43 +280,6 @@ def check_joints(model: mujoco.MjModel) -> Iterator[str]:
             )
 
 
-DOF_FIELDS = ("dof_damping", "dof_armature", "dof_frictionloss")
-"""Properties of joints that MuJoCo keeps per degree of freedom."""
-
-
-def _wrong(model, field: str, kind, is_wrong: Callable, expected: str) -> Iterator[str]:
-    """A message per value of a field that `is_wrong`, with the names of all that have it."""
-    found: dict[str, list[str]] = {}
-    for index, value in enumerate(getattr(model, field)):
-        if np.any(is_wrong(value)):
-            owner = (kind, index)
-            if kind == _OBJ.mjOBJ_DOF:
-                owner = (_OBJ.mjOBJ_JOINT, model.dof_jntid[index])
-            found.setdefault(_shown(value), []).append(_name(model, *owner))
-    for shown, names in found.items():
-        yield f"{field} of {listed(names)} is {shown}: expected {expected}; correct it"
-
-
-def check_numbers(model: mujoco.MjModel) -> Iterator[str]:
-    """Finite numbers, and none below zero where that means nothing."""
-    for fields, kind in (
-        (("body_pos", "body_quat", "body_ipos", "body_mass", "body_inertia"), _OBJ.mjOBJ_BODY),
-        (("jnt_pos", "jnt_axis", "jnt_range", "jnt_stiffness"), _OBJ.mjOBJ_JOINT),
-        (("geom_pos", "geom_quat", "geom_size"), _OBJ.mjOBJ_GEOM),
-        (("actuator_gainprm", "actuator_biasprm", "actuator_forcerange"), _OBJ.mjOBJ_ACTUATOR),
-        (("key_qpos",), _OBJ.mjOBJ_KEY),
-        (("site_pos", "site_quat"), _OBJ.mjOBJ_SITE),
-        (DOF_FIELDS, _OBJ.mjOBJ_DOF),
-    ):
-        for field in fields:
-            yield from _wrong(model, field, kind, lambda x: ~np.isfinite(x), "finite numbers")
-    for field, kind in (
-        *((x, _OBJ.mjOBJ_DOF) for x in DOF_FIELDS),
-        ("jnt_stiffness", _OBJ.mjOBJ_JOINT),
-    ):
-        yield from _wrong(model, field, kind, lambda x: x < 0, "at least 0")
-
-
 def check_masses(model: mujoco.MjModel) -> Iterator[str]:
     """Bodies that move have mass and inertia."""
     moving = model.body_weldid
@@ -328,7 +298,7 @@ def check_masses(model: mujoco.MjModel) -> Iterator[str]:
             f"{each('body', names)} has mass and inertia {shown} kg m²: expected at least "
             f"{MIN_MASS:g} and {MIN_INERTIA:g} for a body that moves; add "
             '<inertial pos="..." mass="..." diaginertia="..."/> (in a URDF, <inertial> with '
-            "<mass> and <inertia>)"
+            "<mass> and a positive definite <inertia>)"
         )
 
 
@@ -449,6 +419,35 @@ def tilt(qpos) -> float:
     return float(np.degrees(np.arccos(np.clip(1 - 2 * (x * x + y * y), -1, 1))))
 
 
+def check_ranges(model: mujoco.MjModel) -> Iterator[str]:
+    """Ranges of torques that a motor can have: both directions, or at least none in between."""
+    ranges = [
+        ("forcerange", _OBJ.mjOBJ_ACTUATOR, i, model.actuator_forcerange[i])
+        for i in range(model.nu)
+    ]
+    ranges += [
+        ("actuatorfrcrange", _OBJ.mjOBJ_JOINT, joint, model.jnt_actfrcrange[joint])
+        for joint in range(model.njnt)
+    ]
+    # The control of a motor is its torque; that of a servo is a position.
+    ranges += [
+        ("ctrlrange", _OBJ.mjOBJ_ACTUATOR, i, model.actuator_ctrlrange[i])
+        for i in range(model.nu)
+        if model.actuator_biastype[i] == mujoco.mjtBias.mjBIAS_NONE
+    ]
+    found: dict[tuple[str, str], list[str]] = {}
+    for attribute, kind, index, (low, high) in ranges:
+        if (low or high) and not low <= 0 < high and is_finite((low, high)).all():
+            names = found.setdefault((attribute, f"{low:g} {high:g}"), [])
+            names.append(_name(model, kind, index))
+    for (attribute, shown), names in found.items():
+        element = "joint" if attribute == "actuatorfrcrange" else "actuator"
+        yield (
+            f'{attribute} of {each(element, names)} is "{shown}": expected a range that contains 0 '
+            'and has a positive maximum, such as "-10 10" (N m); correct it'
+        )
+
+
 def check_spheres(model: mujoco.MjModel) -> Iterator[str]:
     """Geoms of group 5 are collision spheres."""
     other = (model.geom_group == COLLISION_GROUP) & (
@@ -467,14 +466,14 @@ def check_custom(model: mujoco.MjModel) -> Iterator[str]:
     scale, speeds, keep = (
         _numeric(model, name) for name in ("action_scale", "velocity_limits", "keep_nominal")
     )
-    if scale is not None and not (scale.shape == (1,) and 0 < scale[0] < np.inf):
+    if scale is not None and not (scale.shape == (1,) and scale[0] > 0 and is_finite(scale[0])):
         yield (
             f'custom numeric "action_scale" is {_shown(scale)}: expected one number > 0 (rad); '
             'write <custom><numeric name="action_scale" data="0.3"/></custom>'
         )
     count = model.nu or int(np.sum(model.jnt_type == _JOINT.mjJNT_HINGE))
     if speeds is not None and not (
-        speeds.shape == (count,) and np.all((speeds > 0) & (speeds < np.inf))
+        speeds.shape == (count,) and np.all((speeds > 0) & is_finite(speeds))
     ):
         yield (
             f'custom numeric "velocity_limits" is {_shown(speeds)}: expected {count} numbers '
@@ -495,6 +494,7 @@ CHECKS: tuple[Callable[[mujoco.MjModel], Iterator[str]], ...] = (
     check_masses,
     check_loops,
     check_actuators,
+    check_ranges,
     check_spheres,
     check_custom,
 )

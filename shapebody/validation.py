@@ -14,6 +14,16 @@ from shapebody.feet import ends_without_foot
 from shapebody.inference import FLOOR_TOLERANCE, leg_torque
 from shapebody.robots import Robot, examine, find, tilt
 from shapebody.specs import comment, listed
+from shapebody.standing import (
+    FLAT,
+    Held,
+    hold,
+    leg_drop,
+    warn_drives,
+    warn_gains,
+    warn_pose,
+    warn_standing,
+)
 
 TILT = 15.0  # degrees of the trunk in "home" above which something is probably wrong
 RANGE_CHANGE = 0.8  # rad: in a design both limits of a joint can move towards each other by half
@@ -123,80 +133,8 @@ def _report(path: Path) -> Report:
     return Report(path, robot, (), inferred, tuple(warnings), _summary(robot, held))
 
 
-@dataclass(frozen=True)
-class Held:
-    """The robot after some time in its nominal pose under its own gains."""
-
-    finite: bool
-    """False if the simulation failed."""
-    sunk: float
-    """How far the trunk sank, as a share of its height; above 1 if it fell through the floor."""
-    tilt: float
-    """Largest angle of the trunk from its home orientation, rad."""
-    touching: np.ndarray
-    """bool[nf], feet that touched the floor at some time."""
-    saturated: np.ndarray
-    """float[nu], share of the time at the torque limit."""
-
-
-def hold(robot: Robot, seconds: float = 1.0) -> Held:
-    """Simulate the nominal pose with constant targets in the C engine."""
-    model, data = robot.model, mujoco.MjData(robot.model)
-    data.qpos[:] = robot.home
-    data.ctrl[:] = robot.nominal
-    mujoco.mj_forward(model, data)
-    height = max(data.xpos[robot.trunk, 2], 1e-3)
-    up = data.xmat[robot.trunk].reshape(3, 3)[2].copy()
-    lowest, angle = height, 0.0
-    touching = np.zeros(robot.num_feet, bool)
-    saturated = np.zeros(robot.num_actuators)
-    limits = model.actuator_forcerange[:, 1]
-    steps = max(1, round(seconds / model.opt.timestep))
-    finite = True
-    for _ in range(steps):
-        mujoco.mj_step(model, data)
-        finite = bool(np.all(np.abs(data.qvel) < 1e4))  # false for NaN
-        if not finite:
-            break
-        lowest = min(lowest, data.xpos[robot.trunk, 2])
-        cosine = data.xmat[robot.trunk].reshape(3, 3)[2] @ up
-        angle = max(angle, float(np.arccos(np.clip(cosine, -1, 1))))
-        geoms = data.contact.geom[: data.ncon].ravel()
-        touching |= np.isin(robot.feet, geoms)
-        saturated += np.abs(data.actuator_force) >= 0.999 * limits
-    return Held(finite, float(1 - lowest / height), angle, touching, saturated / steps)
-
-
-# Warnings. Each takes the robot and `Held` and yields one message per finding.
-
-
-def warn_standing(robot: Robot, held: Held) -> Iterator[str]:
-    """Does it stand for a second?"""
-    if not held.finite:
-        yield (
-            "the simulation of the nominal pose becomes unstable within 1 s: the gains are too "
-            f"high for the smallest inertias (kp {robot.p_gain:g}, kv {robot.d_gain:g}); lower "
-            "them, or add armature to the joints"
-        )
-    elif held.tilt > np.radians(30) or held.sunk > 0.35:
-        if held.sunk > 1:
-            cause = (
-                "Only its feet touch the floor, so it fell over and the trunk went through: see "
-                'that "home", the feet, kp and the torque limits are as meant'
-            )
-        else:
-            cause = (
-                "With gains as soft as the paper's that is usual (many of its robots do, the Go2 "
-                'among them) and the policy learns to hold it; but see that "home", kp and the '
-                "torque limits are as meant"
-            )
-        yield (
-            f"it falls out of its nominal pose: within 1 s the trunk sinks by {held.sunk:.0%} of "
-            f"its height and tilts by {np.degrees(held.tilt):.0f} degrees. {cause}"
-        )
-    if held.finite and not held.touching.all():
-        feet = listed(robot.model.geom(int(i)).name for i in robot.feet[~held.touching])
-        yield f'feet {feet} do not touch the floor in the nominal pose: correct "home" or the feet'
+# Warnings. Each takes the robot and `Held` and yields one message per finding. More are in
+# `shapebody.standing`.
 
 
 def warn_feet(robot: Robot, held: Held) -> Iterator[str]:
@@ -294,7 +232,8 @@ def warn_plausibility(robot: Robot, held: Held) -> Iterator[str]:
             "the quaternion (numbers 4 to 7 of qpos)"
         )
     mass, height = model.body_mass[1:].sum(), robot.home[2]
-    if not 0.1 < mass < 300 or not 0.03 < height < 3:
+    lies = leg_drop(robot) < FLAT  # its trunk is near the floor whatever the units are
+    if not 0.1 < mass < 300 or not (0.03 < height or lies) or height >= 3:
         yield f"{mass:.3g} kg and a trunk {height:.3g} m high: are the units kg and m?"
     if not np.allclose(model.opt.gravity, [0, 0, -9.81], atol=0.05):
         yield f"gravity is {model.opt.gravity}: expected 0 0 -9.81"
@@ -319,7 +258,16 @@ def _gap(robot: Robot) -> float:
     return float(robot.home[2] - standing_pose(robot, robot.model, robot.nominal)[2])
 
 
-WARNINGS = (warn_standing, warn_feet, warn_torque, warn_limits, warn_plausibility)
+WARNINGS = (
+    warn_pose,
+    warn_standing,
+    warn_drives,
+    warn_gains,
+    warn_feet,
+    warn_torque,
+    warn_limits,
+    warn_plausibility,
+)
 
 
 def _summary(robot: Robot, held: Held) -> dict[str, str]:

@@ -1,0 +1,154 @@
+"""What is wrong in the text of a URDF and MuJoCo's importer does not notice."""
+
+import re
+from collections import Counter
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+
+from shapebody.finite import is_finite, written
+from shapebody.specs import each, listed
+
+
+def check_urdf(path: Path, root) -> list[str]:
+    """Notes on inertias. Raises ValueError for what MuJoCo's importer does not notice."""
+    _check_base(path, root)
+    repeated = [
+        f"repeated name {name!r} in {kind} ({count} of them)"
+        for kind in ("link", "joint")
+        for name, count in Counter(part.get("name") for part in root.findall(kind)).items()
+        if name and count > 1
+    ]
+    wrong: dict[tuple[str, str], list[str]] = {}
+    for attribute in ("velocity", "effort"):
+        for joint, value in limits_of(root, attribute):
+            if not is_finite(number(value)):
+                wrong.setdefault((attribute, value), []).append(repr(joint))
+    reasons = []
+    if repeated:
+        reasons.append(
+            f"{listed(repeated)}. Each name may be used once per kind of "
+            "element; rename one of the two"
+        )
+    for (attribute, value), joints in wrong.items():
+        unit = {"velocity": "rad/s", "effort": "N m"}[attribute]
+        reasons.append(
+            f"{attribute} of {'joint' if len(joints) == 1 else 'joints'} {listed(joints)} is "
+            f"{value!r}: expected a number ({unit}); write it, or expand the xacro template that "
+            "the file comes from"
+        )
+    notes, problems = _check_inertias(root)
+    reasons += problems
+    if not wrong:
+        numbers = [part for kind in ("link", "joint") for part in root.findall(kind)]
+        found = [finding for part in numbers for finding in written(part)]
+        if found:
+            reasons.append(f"expected finite numbers, but {listed(found)}; correct them")
+    if reasons:
+        raise ValueError(f"{path} is not a valid URDF file: {'; '.join(reasons)}")
+    return notes
+
+
+_WORLD = re.compile("(world|ground)(_?(link|frame|plane))?$", re.IGNORECASE)
+
+
+def _check_base(path: Path, root):
+    """Raises ValueError for a robot that is fixed to the world."""
+    joints = root.findall("joint")
+    children = {end(joint, "child") for joint in joints}
+    for link in root.findall("link"):
+        name = link.get("name") or ""
+        below = [joint for joint in joints if end(joint, "parent") == name]
+        if (
+            name not in children
+            and _WORLD.match(name)
+            and {joint.get("type") for joint in below} == {"fixed"}
+        ):
+            fixed = listed(repr(joint.get("name")) for joint in below)
+            bases = listed(repr(end(joint, "child")) for joint in below)
+            raise ValueError(
+                f"{path} cannot be used as a robot: it fixes the base {bases} to the world (link "
+                f"{name!r}, joint {fixed}), as that of an arm on a table: expected a robot that "
+                "walks, with a base that floats. If yours walks, remove that link and that joint"
+            )
+
+
+def _check_inertias(root) -> tuple[list[str], list[str]]:
+    """Notes and problems about inertias that no body has.
+
+    Those that are not positive definite are left out, which is a problem where a moving part has
+    no other. Those with one principal moment above the sum of the others are made equal.
+    """
+    links = {link.get("name"): link for link in root.findall("link")}
+    part = {name: name for name in links}  # the first link of what moves as one
+    fixed = {
+        end(joint, "child"): end(joint, "parent")
+        for joint in root.findall("joint")
+        if joint.get("type") == "fixed"
+    }
+    for name in part:
+        seen = set()
+        while part[name] in fixed and part[name] not in seen:
+            seen.add(part[name])
+            part[name] = fixed[part[name]]
+    wrong, uneven, right = {}, [], set()
+    for name, link in links.items():
+        inertia = link.find("inertial/inertia")
+        if inertia is None:
+            continue
+        xx, yy, zz, xy, xz, yz = (
+            number(inertia.get(key, "0")) for key in ("ixx", "iyy", "izz", "ixy", "ixz", "iyz")
+        )
+        tensor = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
+        if not is_finite(tensor).all() or not tensor.any():
+            continue  # reported as such
+        least, middle, most = np.linalg.eigvalsh(tensor)
+        if least > 1e-12:
+            right.add(part[name])
+            if most - middle - least > 1e-12 * most:
+                mean = (least + middle + most) / 3
+                uneven.append(f"{name!r} ({least:.3g}, {middle:.3g}, {most:.3g}, now {mean:.3g})")
+        else:
+            wrong[name] = f"{name!r} (its smallest principal moment is {least:.3g} kg m²)"
+    lone = [text for name, text in wrong.items() if part[name] not in right]
+    merged = [text for name, text in wrong.items() if part[name] in right]
+    problems = [
+        f"inertia of {each('link', lone)} is not positive definite, which no body has: correct "
+        "ixx to izz, e.g. by those of a box of the same mass and size"
+    ]
+    notes = []
+    if merged:
+        notes.append(
+            f"inertia of {each('link', merged)} is not positive definite, which no body has: it is "
+            "left out, and what moves as one with it has the inertia of the other links"
+        )
+    if uneven:
+        notes.append(
+            f"inertia of {each('link', uneven)} has a principal moment above the sum of the "
+            "others, which no body has: it is replaced by three equal ones of the same sum (kg "
+            "m²); to say it yourself correct ixx to izz"
+        )
+    return notes, problems if lone else []
+
+
+def end(joint, kind: str) -> str | None:
+    """Name of the "parent" or "child" link of a URDF joint."""
+    element = joint.find(kind)
+    return None if element is None else element.get("link")
+
+
+def number(text: str) -> float:
+    """The number that a text is; NaN if it is none."""
+    try:
+        return float(text)
+    except ValueError:
+        return float("nan")
+
+
+def limits_of(root, attribute: str) -> Iterator[tuple[str, str]]:
+    """Joints and the texts of an attribute of their limits."""
+    for joint in root.findall("joint"):
+        limit = joint.find("limit")
+        if limit is not None and limit.get(attribute) is not None:
+            yield joint.get("name"), limit.get(attribute)
