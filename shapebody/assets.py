@@ -5,6 +5,7 @@ a shape that is only for looks must not keep a file from being read.
 """
 
 import html
+import re
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -13,6 +14,7 @@ from pathlib import Path
 import mujoco
 import numpy as np
 
+from shapebody.feet import has_feet, legs_without_geom
 from shapebody.specs import MESHES, carrier, drop_geom, each, listed, unused
 
 READABLE = (".stl", ".obj", ".msh")
@@ -36,7 +38,42 @@ class Lost:
     reason: str
 
 
-def name_meshes(root) -> dict[str, str]:
+def parsed_urdf(root, text: str, notes: list[str]) -> tuple[mujoco.MjSpec, dict[str, str]]:
+    """The spec of a URDF with its visuals, and the mesh files by the names that it has for them.
+
+    `root` is the element of the text, or None if MuJoCo has to read it alone. What a <mujoco>
+    element in the file says holds, with one other default: visuals stay.
+    """
+    if root is None:
+        if "<mujoco" not in text:
+            settings = '<mujoco><compiler discardvisual="false"/></mujoco>'
+            text = re.sub(r"(<robot\b[^<>]*>)", rf"\1{settings}", text, count=1)
+        return mujoco.MjSpec.from_string(text), {}
+    extension = root.find("mujoco")
+    if extension is None:
+        extension = ElementTree.SubElement(root, "mujoco")
+    compiler = extension.find("compiler")
+    if compiler is None:
+        compiler = ElementTree.SubElement(extension, "compiler")
+    # With masses from geoms MuJoCo's own default holds: visuals must not be weighed too.
+    weighed = compiler.get("inertiafromgeom") == "true"
+    looks = compiler.get("discardvisual", "true" if weighed else "false")
+    compiler.set("discardvisual", looks)
+    files = _name_meshes(root)
+
+    def spec():
+        return mujoco.MjSpec.from_string(ElementTree.tostring(root, encoding="unicode"))
+
+    try:
+        return spec(), files
+    except ValueError:
+        if not _mend_visuals(root, notes):
+            mujoco.MjSpec.from_string(text)  # fails too, and names the line of the file
+            raise
+        return spec(), files
+
+
+def _name_meshes(root) -> dict[str, str]:
     """Give each mesh file of a URDF its own name, in place; returns name -> file.
 
     MuJoCo's importer calls meshes by the end of their path, and takes `visual/shin.stl` for
@@ -53,7 +90,7 @@ def name_meshes(root) -> dict[str, str]:
 def find_meshes(spec, path: Path, files: dict[str, str], notes: list[str]) -> Iterator[Lost]:
     """Resolve the mesh files of an imported URDF; drop what is missing or of another kind.
 
-    `files` are the names of `name_meshes`. A file is looked for in the folder that
+    `files` are the names of `_name_meshes`. A file is looked for in the folder that
     <compiler meshdir> names, then beside and above the file, by ever shorter ends of its path;
     "package://" and "file://" names work so too.
     """
@@ -232,7 +269,31 @@ def _error(probe) -> str | None:
     return None
 
 
-def mend_visuals(root, notes: list[str]) -> bool:
+def check_lost(path: Path, model, lost: list[Lost], kind: str):
+    """Raises ValueError if a leg ends in nothing because its meshes were dropped."""
+    if (
+        not lost
+        or np.count_nonzero(model.jnt_type == mujoco.mjtJoint.mjJNT_FREE) != 1
+        or model.njnt < 2
+    ):
+        return
+    names = [model.body(body).name for body in legs_without_geom(model)]
+    to_blame = [loss for loss in lost if loss.carrier in names]
+    if not to_blame and not has_feet(model):
+        to_blame = lost
+    if to_blame:
+        files = listed(dict.fromkeys(Path(x.file).name or "(no name)" for x in to_blame))
+        bodies = listed(dict.fromkeys(x.body for x in to_blame))
+        reasons = listed(dict.fromkeys(x.reason for x in to_blame))
+        where = "a <collision>" if kind == "link" else "a geom"
+        raise ValueError(
+            f"{path} has no foot where legs end in {bodies}, because meshes are dropped: {files} "
+            f"({reasons}). Put files that can be read (binary .stl, or .obj) where the names say, "
+            f"or give {bodies} {where} with a sphere or a box where it touches the floor"
+        )
+
+
+def _mend_visuals(root, notes: list[str]) -> bool:
     """Take out of a URDF what MuJoCo cannot parse and only looks depend on; says whether any.
 
     Of several materials of a visual the first counts, one that cannot be parsed goes, and so does

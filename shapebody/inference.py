@@ -15,22 +15,19 @@ import numpy as np
 from scipy.optimize import least_squares
 
 from shapebody.feet import (
-    FOOT_SHAPES,
-    add_foot,
     colliding,
     foot_ids,
     foot_name,
     idle_tails,
-    is_tall,
     leg_ends,
     leg_length,
     lowest,
     lowest_geoms,
-    shape_name,
     sole_beside,
     solid,
     standing_height,
 )
+from shapebody.foot_shapes import FOOT_SHAPES, add_foot, is_tall, shape_name
 from shapebody.reading import IMU, VELOCITY_LIMIT
 from shapebody.specs import (
     COLLISION_GROUP,
@@ -205,42 +202,30 @@ def infer_feet(spec, model) -> Iterator[str]:
         if FOOT.search(geom.name) and geom.parent.name != "world":
             named.setdefault(int(model.geom_bodyid[index]), []).append(index)
     data = _home_data(model)
-    height = standing_height(model, data)
     tails, marked = [], []
-    groups: dict[int, list[int]] = {}
-    labels: dict[int, str] = {}
-    for body, group in named.items():
-        touching = colliding(model, group)
-        level = data.geom_xpos[group, 2].min()
-        sole = [] if touching else sole_beside(model, data, body, level)
-        if sole:
-            marked += [geoms[index].name for index in group]
-        found = sole or lowest_geoms(model, data, solid(model, touching or group), height)
-        # A sole may be named itself, and then keeps its name.
-        groups.setdefault(int(model.geom_bodyid[found[0]]), found)
-        labels.setdefault(found[0], foot_name(geoms, group if sole else found))
-    as_named = {index for group in named.values() for index in group if len(group) == 1}
+    if named:
+        groups, labels, marked = _named_feet(model, data, geoms, named)
+    else:
+        groups, tails = list(leg_ends(model, data.qpos).values()), idle_tails(model, data.qpos)
+        labels = {group[0]: foot_name(geoms, group) for group in groups}
+    own_names = {group[0] for group in named.values() if len(group) == 1}
     ready = {
         group[0]
-        for group in groups.values()
+        for group in groups
         if len(group) == 1
         and model.geom_type[group[0]] in FOOT_SHAPES
         and not geoms[group[0]].meshname
-        and (group[0] in as_named or not is_tall(model, data, group))
+        and (group[0] in own_names or not is_tall(model, data, group))
     }
-    if named and not marked and len(named) == len(ready) and ready <= as_named:
+    if named and ready == own_names and len(ready) == len(named):
         return
-    if not named:
-        groups = leg_ends(model, data.qpos)
-        tails = idle_tails(model, data.qpos)
-        labels = {group[0]: foot_name(geoms, group) for group in groups.values()}
     # A mesh that is only for looks must not count as a foot.
     for group in named.values():
         for index in group:
             names = {geom.name for geom in spec.geoms}
             rename_geom(spec, geoms[index], unused(FOOT.sub("sole", geoms[index].name), names))
     made = []
-    for group in groups.values():
+    for group in groups:
         geom = geoms[group[0]]
         body = geom.parent
         # The inertia of the body must not follow its new foot.
@@ -280,6 +265,25 @@ def infer_feet(spec, model) -> Iterator[str]:
             'weight, and passes through the floor; to make it a foot put "foot" into the names of '
             "all geoms that touch the floor"
         )
+
+
+def _named_feet(model, data, geoms, named):
+    """Groups of geoms that are feet, the names of the feet by the first geom of a group, and the
+    names of geoms that are no feet; `named` are the ids of named geoms by their bodies."""
+    groups: dict[int, list[int]] = {}
+    labels, marked = {}, []
+    height = standing_height(model, data)
+    for body, group in named.items():
+        touching = colliding(model, group)
+        level = data.geom_xpos[group, 2].min()
+        sole = [] if touching else sole_beside(model, data, body, level)
+        if sole:
+            marked += [geoms[index].name for index in group]
+        found = sole or lowest_geoms(model, data, solid(model, touching or group), height)
+        # Two names for one sole are one foot.
+        groups.setdefault(found[0], found)
+        labels.setdefault(found[0], foot_name(geoms, group if sole else found))
+    return list(groups.values()), labels, marked
 
 
 def infer_height(spec, model) -> Iterator[str]:

@@ -13,8 +13,9 @@ from pathlib import Path
 import mujoco
 import numpy as np
 
-from shapebody.assets import Lost, drop_unreadable, find_meshes, mend_visuals, name_meshes
-from shapebody.feet import add_foot, has_feet, is_tall, legs_without_geom, sole_beside
+from shapebody.assets import check_lost, drop_unreadable, find_meshes, parsed_urdf
+from shapebody.feet import sole_beside
+from shapebody.foot_shapes import add_foot, is_tall
 from shapebody.specs import (
     FOOT,
     MESHES,
@@ -79,7 +80,7 @@ def read(path: Path) -> tuple[str, mujoco.MjSpec, mujoco.MjModel, list[str]]:
     except ValueError as error:
         kind = "URDF" if urdf else "MJCF"
         raise ValueError(f"{path} is not a valid {kind} file: {_explained(error)}") from error
-    _check_lost(path, model, lost, "link" if urdf else "body")
+    check_lost(path, model, lost, "link" if urdf else "body")
     if re.search(r"<include\s", shown):
         notes.append("other files are included: their text is merged into the completed file")
     return text, spec, model, notes
@@ -121,26 +122,6 @@ def _without_comments(text: str) -> str:
         start = closing + 3
         parts.append("\n" * text.count("\n", opening, start))
     return "".join([*parts, text[start:]])
-
-
-def _check_lost(path: Path, model, lost: list[Lost], kind: str):
-    """Raises ValueError if a leg ends in nothing because its meshes were dropped."""
-    if not lost or np.count_nonzero(model.jnt_type == _JOINT.mjJNT_FREE) != 1 or model.njnt < 2:
-        return
-    names = [model.body(body).name for body in legs_without_geom(model)]
-    to_blame = [loss for loss in lost if loss.carrier in names]
-    if not to_blame and not has_feet(model):
-        to_blame = lost
-    if to_blame:
-        files = listed(dict.fromkeys(Path(x.file).name or "(no name)" for x in to_blame))
-        bodies = listed(dict.fromkeys(x.body for x in to_blame))
-        reasons = listed(dict.fromkeys(x.reason for x in to_blame))
-        where = "a <collision>" if kind == "link" else "a geom"
-        raise ValueError(
-            f"{path} has no foot where legs end in {bodies}, because meshes are dropped: {files} "
-            f"({reasons}). Put files that can be read (binary .stl, or .obj) where the names say, "
-            f"or give {bodies} {where} with a sphere or a box where it touches the floor"
-        )
 
 
 def _compile(spec, notes) -> mujoco.MjModel:
@@ -214,9 +195,13 @@ def _check_urdf(path: Path, root):
 def _urdf_root(text: str):
     """Root element of a URDF; None if MuJoCo's more lenient parser has to read it alone."""
     try:
-        return ElementTree.fromstring(text)
+        root = ElementTree.fromstring(text)
     except ElementTree.ParseError:
         return None
+    space, name = root.tag.rpartition("}")[::2]
+    for element in root.iter() if name == "robot" and space else ():
+        element.tag = element.tag.removeprefix(space + "}")
+    return root
 
 
 def _end(joint, kind: str) -> str | None:
@@ -256,7 +241,7 @@ def _number(text: str) -> float:
 
 
 def _import_urdf(path: Path, text: str, notes, lost) -> mujoco.MjSpec:
-    spec, files = _parsed_urdf(text, notes)
+    spec, files = parsed_urdf(_urdf_root(text), text, notes)
     spec.modelfiledir = str(path.parent.absolute())
     spec.compiler.fusestatic = False
     spec.compiler.discardvisual = False
@@ -276,38 +261,6 @@ def _import_urdf(path: Path, text: str, notes, lost) -> mujoco.MjSpec:
             body.fullinertia, body.inertia = np.full(6, np.nan), np.full(3, 1e-14)
     lost += find_meshes(spec, path, files, notes)
     return spec
-
-
-def _parsed_urdf(text: str, notes) -> tuple[mujoco.MjSpec, dict[str, str]]:
-    """The spec of a URDF with its visuals, and the mesh files by the names that it has for them.
-
-    What a <mujoco> element in the file says holds, with one other default: visuals stay.
-    """
-    root = _urdf_root(text)
-    if root is None:
-        return mujoco.MjSpec.from_string(text), {}
-    extension = root.find("mujoco")
-    if extension is None:
-        extension = ElementTree.SubElement(root, "mujoco")
-    compiler = extension.find("compiler")
-    if compiler is None:
-        compiler = ElementTree.SubElement(extension, "compiler")
-    # With masses from geoms MuJoCo's own default holds: visuals must not be weighed too.
-    weighed = compiler.get("inertiafromgeom") == "true"
-    looks = compiler.get("discardvisual", "true" if weighed else "false")
-    compiler.set("discardvisual", looks)
-    files = name_meshes(root)
-
-    def spec():
-        return mujoco.MjSpec.from_string(ElementTree.tostring(root, encoding="unicode"))
-
-    try:
-        return spec(), files
-    except ValueError:
-        if not mend_visuals(root, notes):
-            mujoco.MjSpec.from_string(text)  # fails too, and names the line of the file
-            raise
-        return spec(), files
 
 
 def _float(spec, model, text, notes) -> mujoco.MjModel:

@@ -1,4 +1,4 @@
-"""Importing: what a file says beside the point costs nothing, and feet are what bears the weight."""
+"""Importing: what is beside the point in a file costs nothing, and feet are what bears weight."""
 
 import struct
 
@@ -150,6 +150,22 @@ def test_comments_say_nothing(tmp_path, plain, comment):
     assert robot.inferred == plain.inferred
 
 
+@pytest.mark.parametrize(
+    "old, new",
+    [
+        ("<robot", '<robot xmlns="http://www.ros.org"'),
+        ("<robot", '<robot xmlns:xacro="http://ros.org/wiki/xacro"'),
+        ("</robot>", "<gazebo><lidar:noise/></gazebo></robot>"),  # a prefix that nothing declares
+    ],
+)
+def test_namespaces_say_nothing(tmp_path, plain, old, new):
+    path = decorated(tmp_path, visual('<box size="0.1 0.1 0.1"/>'))
+    path.write_text(path.read_text().replace(old, new))
+    robot = load_robot(path)
+    assert robot.model.ngeom == plain.model.ngeom + 1 and robot.num_feet == 2
+    assert list(robot.velocity_limits[:2]) in ([10, 10], [15, 15])
+
+
 def test_a_template_is_a_template(tmp_path):
     path = biped(tmp_path, extra="<!-- a --><xacro:leg/><!-- b -->")
     with pytest.raises(ValueError, match="xacro template"):
@@ -237,10 +253,16 @@ def walker(shin="", trunk="", extra="", foot='<geom type="sphere" size="0.02" po
         mass="0.4"/><body name="{name}_shin" pos="0 0 -0.2"><joint name="{name}_knee" axis="0 1 0"
         range="-100 60" armature="0.01"/><inertial mass="0.2" pos="0 0 -0.1"
         diaginertia="0.001 0.001 0.0001"/>{shin or foot}</body></body>"""
-        for name, x, y in (("fl", 0.2, 0.1), ("fr", 0.2, -0.1), ("rl", -0.2, 0.1), ("rr", -0.2, -0.1))
+        for name, x, y in (
+            ("fl", 0.2, 0.1),
+            ("fr", 0.2, -0.1),
+            ("rl", -0.2, 0.1),
+            ("rr", -0.2, -0.1),
+        )
     )
     return f"""<mujoco model="walker"><worldbody><body name="trunk" pos="0 0 0.42"><freejoint/>
-    <geom type="box" size="0.2 0.1 0.05" mass="4"/>{trunk}{legs}{extra}</body></worldbody></mujoco>"""
+    <geom type="box" size="0.2 0.1 0.05" mass="4"/>{trunk}{legs}{extra}</body>
+    </worldbody></mujoco>"""
 
 
 TWO = '<material name="a"><color rgba="1 0 0 1"/></material><material name="b"/>'
@@ -344,3 +366,198 @@ def test_missing_meshes_are_the_reason_why_there_is_no_foot(tmp_path):
     path.write_text(path.read_text().replace("</robot>", f"{arm}</robot>"))
     robot = load_robot(path)
     assert robot.num_feet == 2 and noted(robot, "lost.dae (link arm)")
+
+
+# Feet.
+
+MARKER = visual('<sphere radius="0.01"/>')
+FRAMES = {
+    "marker on the sole": (("sole", "0.02 0 -0.045", MARKER), "sole"),
+    "marker without a size": (("sole", "0.02 0 -0.045", visual('<box size="0 0 0"/>')), "sole"),
+    "large marker": (("sole", "0.02 0 -0.045", visual('<sphere radius="0.03"/>')), "sole"),
+    "frame at the sole": (("sole", "0.02 0 -0.045", ""), "sole"),
+    "frame inside of the sole": (("sole", "0 0 -0.03", ""), "sole"),
+    "frame at the ankle": (("sole", "0 0 0", ""), "sole"),
+    "frame on the shin": (("shin", "0.02 0 -0.345", ""), "sole"),
+    "missing mesh": (("sole", "0.02 0 -0.04", mesh("lost.stl", "visual")), "sole"),
+    # What is below all that collides is a foot, whatever it is made of.
+    "frame far below": (("sole", "0 0 -0.2", ""), "ball"),
+    "collision below": (("sole", "0 0 -0.2", MARKER.replace("visual", "collision")), "ball"),
+}
+
+
+@pytest.mark.parametrize("case", FRAMES)
+def test_a_frame_or_marker_does_not_replace_the_sole(tmp_path, case):
+    frame, expected = FRAMES[case]
+    robot = load_robot(biped(tmp_path, frame=frame))
+    found = feet(robot)
+    assert list(found) == ["l_foot", "r_foot"]
+    for body, kind, size in found.values():
+        assert body.endswith("_sole")
+        if expected == "sole":
+            assert kind == "box"
+            np.testing.assert_allclose(size, [0.08, 0.03, 0.015])
+        else:
+            assert kind == "sphere"
+    assert noted(robot, "links l_foot, r_foot have no <collision>", "beside") == (
+        expected == "sole"
+    )
+
+
+def test_several_frames_of_one_leg(tmp_path):
+    # Two markers, more than the link with the sole has shapes.
+    path = biped(tmp_path, sole="", frame=("sole", "0 0 0", SOLE))
+    links = "".join(
+        f'<link name="{side}_foot_frame">{MARKER * 2}</link>'
+        + FIXED.format(parent=f"{side}_foot", child=f"{side}_foot_frame", xyz="0 0 -0.045")
+        for side in "lr"
+    )
+    path.write_text(path.read_text().replace("</robot>", f"{links}</robot>"))
+    assert [kind for _, kind, _ in feet(load_robot(path)).values()] == ["box", "box"]
+
+
+MARKED = '<geom name="{}_foot" type="sphere" size="0.01" pos="0 0 -0.22" {}/>'
+UNSEEN = 'contype="0" conaffinity="0"'
+
+
+@pytest.mark.parametrize("fixed", [False, True])
+def test_markers_of_mjcf(tmp_path, fixed):
+    path = tmp_path / "walker.xml"
+    ball = '<geom type="sphere" size="0.02" pos="0 0 -0.2"/>'
+    text = walker(foot=f"{ball}MARKER")
+    for leg in ("fl", "fr", "rl", "rr"):
+        marker = MARKED.format(leg, UNSEEN)
+        marker = f'<body name="{leg}_frame">{marker}</body>' if fixed else marker
+        text = text.replace("MARKER", marker, 1)
+    path.write_text(text)
+    robot = load_robot(path)
+    found = feet(robot)
+    assert list(found) == [f"{leg}_foot" for leg in ("fl", "fr", "rl", "rr")]
+    assert all(size[0] == 0.02 for _, _, size in found.values())
+    assert noted(robot, "touch nothing", "fl_foot")
+    # Named, and in contact with the floor, by itself or by a pair: as the file says.
+    path.write_text(text.replace(UNSEEN, ""))
+    assert all(size[0] == 0.01 for _, _, size in feet(load_robot(path)).values())
+
+
+SHINS = {
+    "mesh": (SHANK, 0),
+    "wide mesh": (stl((-0.04, -0.03, -0.2), (0.04, 0.03, 0)), 0),
+    "mesh that leans": (SHANK, 0.5),
+    "box": (None, 0),
+    "box that leans": (None, 0.5),
+}
+
+
+@pytest.mark.parametrize("case", SHINS)
+def test_the_foot_of_a_shank_is_its_lower_end(tmp_path, case):
+    data, pitch = SHINS[case]
+    if data:
+        (tmp_path / "shank.stl").write_bytes(data)
+        shin = mesh("shank.stl")
+    else:
+        shin = SOLE.replace("0.16 0.06 0.03", "0.02 0.03 0.2").replace("0.02 0 -0.03", "0 0 -0.1")
+    path = biped(tmp_path, shin, None)
+    text = path.read_text()
+    for side in "lr":  # shins that lean in the zero pose
+        joint = f'<child link="{side}_shin"/>\n    <origin xyz="0 0 -0.3"'
+        assert joint in text
+        text = text.replace(joint, f'{joint} rpy="0 {pitch} 0"')
+    path.write_text(text)
+    robot = load_robot(path)
+    assert noted(robot, "the lower end of a ")
+    data = mujoco.MjData(robot.model)
+    data.qpos[:] = robot.home
+    mujoco.mj_kinematics(robot.model, data)
+    assert robot.num_feet == 2
+    for foot in robot.feet:
+        frame, size = data.geom_xmat[foot].reshape(3, 3), robot.model.geom_size[foot]
+        box = robot.model.geom_type[foot] == mujoco.mjtGeom.mjGEOM_BOX
+        half = np.abs(frame[2]) @ size if box else size[0]
+        assert half <= 0.025
+        # It is where the shank ends.
+        where = data.geom_xpos[foot] - data.xpos[robot.model.geom_bodyid[foot]]
+        end = np.array([-np.sin(pitch), 0, -np.cos(pitch)]) * 0.2
+        assert np.linalg.norm(where - end) < 0.05
+        np.testing.assert_allclose(data.geom_xpos[foot, 2] - half, 0, atol=0.01)
+    # The shank is still seen.
+    shin = robot.model.body("l_shin").id
+    assert np.sum(robot.model.geom_bodyid == shin) == 2
+
+
+def test_low_feet_stay_whole(tmp_path):
+    (tmp_path / "boot.stl").write_bytes(stl((-0.06, -0.03, -0.05), (0.1, 0.03, 0)))
+    robot = load_robot(biped(tmp_path, sole=mesh("boot.stl")))
+    for _, kind, size in feet(robot).values():
+        assert kind == "box"
+        np.testing.assert_allclose(np.sort(size), [0.025, 0.03, 0.08], atol=1e-6)
+
+
+TAIL = """<body name="tail" pos="{root}"><joint name="tail_pitch" axis="0 1 0" range="-40 40"
+armature="0.01"/><geom type="capsule" size="0.02" fromto="0 0 0 {end}" mass="{mass}"/>
+{more}</body>"""
+SECOND = """<body name="tail_tip" pos="-0.15 0 -0.2"><joint name="tip" axis="0 1 0" range="-40 40"
+armature="0.01"/><geom type="capsule" size="0.02" fromto="0 0 0 -0.1 0 -0.22"
+mass="0.1"/></body>"""
+IDLE = {
+    "as low as the legs": ("-0.2 0 0.05", "-0.3 0 -0.42", 0.2, ""),
+    "a little higher": ("-0.2 0 0.05", "-0.3 0 -0.41", 0.2, ""),
+    "lower than the legs": ("-0.2 0 0.05", "-0.1 0 -0.65", 0.2, ""),
+    "of two joints": ("-0.2 0 0.05", "-0.15 0 -0.2", 0.1, SECOND),
+    "a trunk at the front": ("0.2 0 0.05", "0.3 0 -0.42", 0.2, ""),
+}
+
+
+@pytest.mark.parametrize("case", IDLE)
+def test_a_tail_is_no_foot(tmp_path, case):
+    root, end, mass, more = IDLE[case]
+    path = tmp_path / "walker.xml"
+    tail = TAIL.format(root=root, end=end, mass=mass, more=more)
+    path.write_text(walker(extra=tail))
+    report = validate_robot(path)
+    assert report.ok and report.robot.num_feet == 4
+    assert noted(report.robot, "tail that bears no weight")
+    assert not any("reach the floor like legs" in warning for warning in report.warnings)
+    # What is named is a foot.
+    named = '<geom name="tail_foot"'.join(tail.rsplit("<geom", 1))
+    path.write_text(walker(extra=named, foot='<geom name="F" size="0.02" pos="0 0 -0.2"/>'))
+    text = path.read_text()
+    for leg in "abcd":
+        text = text.replace('name="F"', f'name="{leg}_foot"', 1)
+    path.write_text(text)
+    assert load_robot(path).num_feet == 5
+
+
+def test_a_tail_that_bears_weight_is_a_foot(tmp_path):
+    # The hind legs are gone: what is left stands on the front legs and the tail.
+    path = tmp_path / "walker.xml"
+    text = walker(extra=TAIL.format(root="-0.2 0 0.05", end="-0.1 0 -0.45", mass=0.5, more=""))
+    start, end = text.index('<body name="rl_thigh"'), text.index('<body name="tail"')
+    path.write_text(text[:start] + text[end:])
+    robot = load_robot(path)
+    assert [body for body, _, _ in feet(robot).values()] == ["fl_shin", "fr_shin", "tail"]
+
+
+@pytest.mark.parametrize("count", [3, 5, 6])
+def test_no_leg_of_a_star_is_a_tail(tmp_path, count):
+    angles = 2 * np.pi * np.arange(count) / count
+    text = walker()
+    start, end = text.index('<body name="fl_thigh"'), text.rindex("</body>")
+    legs = "".join(
+        f'<body name="arm{i}" pos="{np.cos(a):.6f} {np.sin(a):.6f} 0"><joint name="j{i}" '
+        'axis="0 1 0" range="-60 60" armature="0.01"/><geom type="capsule" size="0.02" '
+        'fromto="0 0 0 0 0 -0.4" mass="0.3"/></body>'
+        for i, a in enumerate(angles)
+    )
+    path = tmp_path / "star.xml"
+    path.write_text(text[:start] + legs + text[end:])
+    assert load_robot(path).num_feet == count
+
+
+def test_a_leg_unlike_its_partner_is_a_leg(tmp_path):
+    # A longer thigh and a shorter shin: other lengths than those of all other legs.
+    text = walker()
+    text = text.replace('name="fl_thigh" pos="0.2 0.1 0"', 'name="fl_thigh" pos="0.3 0.12 0"')
+    path = tmp_path / "walker.xml"
+    path.write_text(text)
+    assert load_robot(path).num_feet == 4
