@@ -108,11 +108,12 @@ def find_meshes(spec, path: Path, files: dict[str, str], notes: list[str]) -> It
         places += [folder.joinpath(*end) for folder in path.parents for end in ends]
         found = next((place for place in places if place.is_file()), None)
         if found is None or found.suffix.lower() not in READABLE:
-            lost[mesh.name] = file
+            kind = "not found" if found is None else f"MuJoCo cannot read {found.suffix} files"
+            lost[mesh.name] = file, kind
         else:
             mesh.file = str(found)
     spec.meshdir, spec.strippath = "", False  # the names are whole paths now
-    dropped = list(_drop_meshes(spec, {name: (file, "missing") for name, file in lost.items()}))
+    dropped = list(_drop_meshes(spec, lost))
     if lost:
         count = f"{len(lost)} meshes are" if len(lost) > 1 else "1 mesh is"
         notes.append(

@@ -170,4 +170,7 @@ def add_foot(spec, geoms, model, data, group):
 def shape_name(model, group) -> str:
     """What a group of geoms is, for a message."""
     kinds = {_GEOM(model.geom_type[i]).name.removeprefix("mjGEOM_").lower() for i in group}
-    return f"{len(group)} geoms" if len(group) > 1 else f"a {kinds.pop()}"
+    if len(group) > 1:
+        return f"{len(group)} geoms"
+    kind = kinds.pop()
+    return f"an {kind}" if kind == "ellipsoid" else f"a {kind}"
