@@ -12,13 +12,15 @@ from pathlib import Path
 import mujoco
 import numpy as np
 
+from shapebody.assets import check_lost, drop_unreadable, find_meshes, parsed_urdf
+from shapebody.feet import sole_beside
 from shapebody.finite import written
+from shapebody.foot_shapes import add_foot, is_tall
 from shapebody.specs import (
     FOOT,
     MESHES,
     add_floor,
-    drop_assets,
-    drop_geom,
+    carrier,
     each,
     listed,
     name_parts,
@@ -51,34 +53,40 @@ def read(path: Path) -> tuple[str, mujoco.MjSpec, mujoco.MjModel, list[str]]:
         ) from error
     if not text.strip():
         raise ValueError(f"{path} is empty: expected an MJCF or URDF file; write the robot to it")
-    if "<xacro:" in text:
+    shown = _without_comments(text)
+    if "<xacro:" in shown:
         raise ValueError(
             f"{path} is a xacro template: expected a URDF; expand it first with "
             "'xacro FILE > robot.urdf', where ROS is installed"
         )
-    root = re.search(r"<([A-Za-z_][\w:.-]*)", re.sub(r"<!--.*?-->", "", text, flags=re.DOTALL))
+    root = re.search(r"<([A-Za-z_][\w:.-]*)", shown)
     urdf = root.group(1) == "robot" if root else path.suffix.lower() == ".urdf"
-    notes = []
+    notes, lost = [], []
     if urdf:
         notes.append("the file is a URDF: it is imported by MuJoCo and completed as MJCF")
-        text = _prepared_urdf(path, text, notes)
+        text = _prepared_urdf(path, shown, notes)
     try:
         if urdf:
-            spec = _import_urdf(path, text, notes)
+            spec = _import_urdf(path, text, notes, lost)
         elif path.suffix == ".xml":
             spec = mujoco.MjSpec.from_file(str(path))
         else:  # MuJoCo knows a file by this ending only
             spec = mujoco.MjSpec.from_string(text)
             spec.modelfiledir = str(path.parent.absolute())
         name_parts(spec)
-        model = _compile(spec, notes)
+        try:
+            model = _compile(spec, notes)
+        except ValueError:
+            lost += drop_unreadable(spec, "link" if urdf else "body", notes)
+            model = _compile(spec, notes)
         if urdf:
             model = _float(spec, model, text, notes)
     except ValueError as error:
         kind = "URDF" if urdf else "MJCF"
         reason = _explained(error, kind, text)
         raise ValueError(f"{path} is not a valid {kind} file: {reason}") from error
-    if re.search(r"<include\s", text):
+    check_lost(path, model, lost, "link" if urdf else "body")
+    if re.search(r"<include\s", shown):
         notes.append("other files are included: their text is merged into the completed file")
     return text, spec, model, notes
 
@@ -122,8 +130,21 @@ def _explained(error: Exception, kind: str, text: str) -> str:
     return f"MuJoCo reports {reason!r}. {fix[0].upper()}{fix[1:]}"
 
 
+def _without_comments(text: str) -> str:
+    """The text of an XML file without its comments, with the same lines."""
+    parts, start = [], 0
+    while (opening := text.find("<!--", start)) >= 0:
+        parts.append(text[start:opening])
+        closing = text.find("-->", opening + 4)
+        if closing < 0:
+            return "".join(parts)
+        start = closing + 3
+        parts.append("\n" * text.count("\n", opening, start))
+    return "".join([*parts, text[start:]])
+
+
 def _compile(spec, notes) -> mujoco.MjModel:
-    """The compiled model; without meshes and textures if their files cannot be read."""
+    """The compiled model, with a floor if contact pairs name one that is not there."""
     names = {geom.name for geom in spec.geoms}
     if any({pair.geomname1, pair.geomname2} - names == {"floor"} for pair in spec.pairs):
         notes.append(add_floor(spec))
@@ -131,28 +152,6 @@ def _compile(spec, notes) -> mujoco.MjModel:
         return spec.compile()
     except ValueError as error:
         first = error
-    if spec.meshes or spec.hfields or any(texture.file for texture in spec.textures):
-        bodies = sorted(
-            {geom.parent.name for geom in spec.geoms if geom.meshname or geom.type in MESHES}
-            & {body.name for body in spec.bodies if not body.explicitinertial}
-        )
-        reason = str(first).strip().splitlines()[0]
-        for geom in [geom for geom in spec.geoms if geom.meshname or geom.type in MESHES]:
-            drop_geom(spec, geom)
-        drop_assets(spec)
-        notes.append(
-            f"mesh or texture files cannot be read ({reason}): the robot is loaded without them"
-            + (
-                f"; bodies {listed(bodies)} have no <inertial>, so their mass comes from their "
-                "other geoms alone: add <inertial>, or put the files in place"
-                if bodies
-                else ""
-            )
-        )
-        try:
-            return spec.compile()
-        except ValueError as error:
-            first = error
     if "moving bodies" in str(first):
         # With tiny masses it compiles, and the checks can name every such body.
         spec.compiler.boundmass, spec.compiler.boundinertia = 1e-12, 1e-14
@@ -190,9 +189,13 @@ def _prepared_urdf(path: Path, text: str, notes) -> str:
 def _urdf_root(text: str):
     """Root element of a URDF; None if MuJoCo's more lenient parser has to read it alone."""
     try:
-        return ElementTree.fromstring(text)
+        root = ElementTree.fromstring(text)
     except ElementTree.ParseError:
         return None
+    space, name = root.tag.rpartition("}")[::2]
+    for element in root.iter() if name == "robot" and space else ():
+        element.tag = element.tag.removeprefix(space + "}")
+    return root
 
 
 def _empty_root(root) -> str | None:
@@ -217,11 +220,8 @@ def _empty_root(root) -> str | None:
     return tops[0].get("name")
 
 
-def _import_urdf(path: Path, text: str, notes) -> mujoco.MjSpec:
-    if not re.search(r"<mujoco[\s>]", text):
-        settings = '<mujoco><compiler fusestatic="false" discardvisual="false"/></mujoco>'
-        text = re.sub(r"(<robot\b[^>]*>)", lambda found: found.group(1) + settings, text, count=1)
-    spec = mujoco.MjSpec.from_string(text)
+def _import_urdf(path: Path, text: str, notes, lost) -> mujoco.MjSpec:
+    spec, files = parsed_urdf(_urdf_root(text), text, notes)
     spec.modelfiledir = str(path.parent.absolute())
     spec.compiler.fusestatic = False
     spec.compiler.discardvisual = False
@@ -229,6 +229,8 @@ def _import_urdf(path: Path, text: str, notes) -> mujoco.MjSpec:
     for body in spec.bodies[1:]:
         xx, yy, zz, xy, xz, yz = body.fullinertia
         tensor = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
+        if spec.compiler.inertiafromgeom == mujoco.mjtInertiaFromGeom.mjINERTIAFROMGEOM_TRUE:
+            continue
         if not body.explicitinertial or (body.mass == 0 and not tensor.any()):
             # A link without <inertial> has no mass; MuJoCo would give it the density of water.
             body.explicitinertial = False
@@ -237,35 +239,8 @@ def _import_urdf(path: Path, text: str, notes) -> mujoco.MjSpec:
                 geom.mass = 0
         elif not (np.isfinite(tensor).all() and np.linalg.eigvalsh(tensor)[0] > 1e-12):
             body.fullinertia, body.inertia = np.full(6, np.nan), np.full(3, 1e-14)
-    _find_meshes(spec, path, notes)
+    lost += find_meshes(spec, path, files, notes)
     return spec
-
-
-def _find_meshes(spec, path: Path, notes):
-    """Resolve "package://" names beside and above the file; drop what MuJoCo cannot read."""
-    lost = {}
-    for mesh in spec.meshes:
-        parts = Path(mesh.file.split("://")[-1]).parts
-        places = (
-            folder.joinpath(*parts[i:])
-            for folder in path.absolute().parents
-            for i in range(len(parts))
-        )
-        found = next((place for place in places if place.is_file()), None)
-        if found is None or found.suffix.lower() not in (".stl", ".obj", ".msh"):
-            lost[mesh.name] = mesh.file
-        else:
-            mesh.file = str(found)
-    for geom in [geom for geom in spec.geoms if geom.meshname in lost]:
-        spec.delete(geom)
-    for mesh in [mesh for mesh in spec.meshes if mesh.name in lost]:
-        spec.delete(mesh)
-    if lost:
-        names = listed(Path(file).name for file in lost.values())
-        notes.append(
-            f"{len(lost)} meshes are not found beside the file, or of a kind that MuJoCo cannot "
-            f"read (it reads .stl, .obj and .msh): {names}; the robot is loaded without them"
-        )
 
 
 def _float(spec, model, text, notes) -> mujoco.MjModel:
@@ -339,32 +314,62 @@ _FOOT_LINK = re.compile(r"foot(_?link|_?frame)?(_?\d+|_[lr])?$", re.IGNORECASE)
 
 
 def _feet_of_links(spec, fixed) -> Iterator[str]:
-    """Geoms of fixed links with "foot" in their names become feet, one link per leg."""
+    """Geoms of fixed links with "foot" in their names become feet, one link per leg.
+
+    A link that touches nothing is a frame or a marker if another part of its leg collides as low:
+    then that part is the foot.
+    """
     if any(FOOT.search(geom.name) for geom in spec.geoms):
         return
     links = {}
     for link in (link for link in fixed if _FOOT_LINK.search(link.name)):
-        leg = link.parent
-        while leg.name != "world" and not leg.joints:
-            leg = leg.parent
-        best = links.setdefault(leg.name, link)
-        links[leg.name] = link if len(link.geoms) > len(best.geoms) else best
-    guessed = []
+        leg = carrier(spec, link).name
+        best = links.setdefault(leg, link)
+        links[leg] = max(best, link, key=lambda x: (_touching(x) != [], len(x.geoms)))
+    feet = {link.name: _touching(link) for link in links.values()}
+    guessed, markers = [], []
+    if not all(feet.values()):
+        model = spec.compile()
+        data = mujoco.MjData(model)
+        mujoco.mj_kinematics(model, data)
+        geoms = {geom.id: geom for geom in spec.geoms}
+        soles = {}
+        for link in (link for link in links.values() if not feet[link.name]):
+            shown = [data.geom_xpos[geom.id, 2] for geom in link.geoms]
+            level = min(shown, default=data.xpos[link.id, 2])
+            soles[link.name] = sole_beside(model, data, link.id, level)
+        for name, group in soles.items():
+            if group:
+                markers.append(name)
+                tall = is_tall(model, data, group)
+                feet[name] = [geoms[index] for index in group]
+                if tall:
+                    feet[name] = [add_foot(spec, geoms, model, data, group)]
     for link in links.values():
-        if not link.geoms:
+        if not feet[link.name] and not link.geoms:
             length, body = 0.0, link
             while body.parent.name != "world":
                 length, body = length + np.linalg.norm(body.pos), body.parent
             radius = float(f"{0.04 * length:.2g}")
             link.add_geom(type=_GEOM.mjGEOM_SPHERE, size=[radius, 0, 0], mass=0)
             guessed.append(f"{link.name!r} ({radius:g} m)")
-        touching = [geom for geom in link.geoms if geom.contype] or link.geoms
-        solid = [geom for geom in touching if geom.type not in MESHES]
-        for geom in solid or touching:
+        shapes = feet[link.name] or list(link.geoms)
+        solid = [geom for geom in shapes if geom.type not in MESHES]
+        for geom in solid or shapes:
             geom.name = unused(link.name, {other.name for other in spec.geoms})
+    if markers:
+        yield (
+            f"links {listed(markers)} have no <collision> and are beside other parts of their legs "
+            "that have one, which are the feet under these names; to say it yourself give the link "
+            "a <collision> with a sphere or a box"
+        )
     if guessed:
         yield (
             f"links {', '.join(guessed)} have no geometry that can be read: their feet are spheres "
             "at the origin of the link with a radius of 4 % of the leg; to say it yourself give "
             "the link a <collision> with a sphere or a box"
         )
+
+
+def _touching(link) -> list:
+    return [geom for geom in link.geoms if geom.contype]

@@ -45,6 +45,18 @@ def ordered(elements) -> list:
     return sorted(elements, key=lambda element: element.id)
 
 
+def carrier(spec, body):
+    """The body of a spec that moves a body: itself, or the one that it is fixed to.
+
+    Fixed to the base, or to the world, it is the outermost body.
+    """
+    # `body.joints` raises the compiler's error again if the spec did not compile.
+    moving = {joint.parent.name for joint in spec.joints}
+    while body.name not in moving and body.name != "world" and body.parent.name != "world":
+        body = body.parent
+    return body
+
+
 def name_parts(spec):
     """Name what other elements refer to and MJCF leaves optional."""
     taken = {joint.name for joint in spec.joints}
@@ -91,11 +103,17 @@ def keep_inertias_writable(spec, model):
             body.inertia = np.where(moments == largest, moments, moments + margin)
 
 
-def replace_geom(spec, geom, kind, size, position, quaternion):
-    """A new geom in the place of another one, with its name and looks, posed in the body frame."""
+def add_like(geom, kind, size, position, quaternion):
+    """A new geom without a name, with the looks of another one, posed in the frame of its body."""
     new = geom.parent.add_geom(type=kind, size=size, pos=position, quat=quaternion)
     for name in ("group", "rgba", "material", "contype", "conaffinity"):
         setattr(new, name, getattr(geom, name))
+    return new
+
+
+def replace_geom(spec, geom, kind, size, position, quaternion):
+    """A new geom in the place of another one, with its name and looks, posed in the body frame."""
+    new = add_like(geom, kind, size, position, quaternion)
     name = geom.name
     spec.delete(geom)
     new.name = name
