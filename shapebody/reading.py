@@ -13,6 +13,7 @@ from pathlib import Path
 import mujoco
 import numpy as np
 
+from shapebody.guard import admit, require_writable
 from shapebody.specs import (
     FOOT,
     MESHES,
@@ -35,8 +36,10 @@ _GEOM, _JOINT = mujoco.mjtGeom, mujoco.mjtJoint
 def read(path: Path) -> tuple[str, mujoco.MjSpec, mujoco.MjModel, list[str]]:
     """Text, spec, compiled model and first notes of an MJCF or URDF file.
 
-    Raises ValueError, naming the fix, for a file that is no text, empty, cut off or not valid.
+    Raises ValueError, naming the fix, for a file that is no text, empty, cut off or not valid, and
+    for one that MuJoCo should not be given (`shapebody.guard`).
     """
+    admit(path)
     try:
         text = path.read_bytes().decode("utf-8-sig")
     except UnicodeDecodeError as error:
@@ -73,6 +76,7 @@ def read(path: Path) -> tuple[str, mujoco.MjSpec, mujoco.MjModel, list[str]]:
     except ValueError as error:
         kind = "URDF" if urdf else "MJCF"
         raise ValueError(f"{path} is not a valid {kind} file: {_explained(error)}") from error
+    require_writable(path, model)
     if re.search(r"<include\s", text):
         notes.append("other files are included: their text is merged into the completed file")
     return text, spec, model, notes
@@ -240,7 +244,7 @@ def _number(text: str) -> float:
 def _import_urdf(path: Path, text: str, notes) -> mujoco.MjSpec:
     if not re.search(r"<mujoco[\s>]", text):
         settings = '<mujoco><compiler fusestatic="false" discardvisual="false"/></mujoco>'
-        text = re.sub(r"(<robot\b[^>]*>)", lambda found: found.group(1) + settings, text, count=1)
+        text = re.sub(r"(<robot\b[^<>]*>)", lambda found: found.group(1) + settings, text, count=1)
     spec = mujoco.MjSpec.from_string(text)
     spec.modelfiledir = str(path.parent.absolute())
     spec.compiler.fusestatic = False
