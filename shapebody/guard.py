@@ -8,6 +8,7 @@ more than any robot needs. Then it is read once in another process, under limits
 from __future__ import annotations
 
 import atexit
+import contextlib
 import json
 import os
 import signal
@@ -118,7 +119,7 @@ class _Reader:
                         f"{path} cannot be read within {SECONDS} s: expected the file of a robot; "
                         "give it simpler meshes and fewer elements"
                     ), False
-                code = self.process.poll()
+                code = self._code()
                 self.stop()
                 if not used:  # else an earlier file, or its end after a pause, may be the cause
                     break
@@ -127,6 +128,12 @@ class _Reader:
                 "file of a robot. It happened in another process, so nothing is lost; to find the "
                 "element that causes it, remove one half of the file after the other"
             ), True
+
+    def _code(self) -> int | None:
+        try:
+            return self.process.wait(5)  # its pipe is closed before it has ended
+        except subprocess.TimeoutExpired:
+            return None
 
     def _start(self) -> bool:
         self.stop()
@@ -177,7 +184,7 @@ _reader = _Reader()
 def _cause(code: int | None) -> str:
     try:
         return signal.Signals(-code).name
-    except (TypeError, ValueError):
+    except (TypeError, ValueError):  # None; an exit status
         return f"exit status {code}"
 
 
@@ -195,7 +202,8 @@ def serve() -> None:
         _alarm(SECONDS + 5)  # if nobody is there any more to end it
         problem = ""
         try:
-            os.chdir(request["folder"])
+            with contextlib.suppress(OSError):  # only relative paths need it
+                os.chdir(request["folder"])
             read(Path(request["path"]))
         except ValueError as error:
             problem = str(error)

@@ -283,7 +283,12 @@ def _check_numbers(survey: _Survey, place: str, tag: str, attributes: dict[str, 
 
 def _text(survey: _Survey, path: Path, place: str) -> str:
     survey.spend("bytes of text", _checked(survey, path, place).st_size, place)
-    data = path.read_bytes()
+    try:
+        data = path.read_bytes()
+    except OSError:
+        if path == survey.path:
+            raise
+        return ""  # MuJoCo says so, with the place
     survey.files[os.path.realpath(path)] = hashlib.sha256(data).hexdigest()
     text = data.decode("utf-8-sig", errors="replace")
     if (start := text.rfind("<!--")) > text.rfind("-->"):
@@ -334,8 +339,11 @@ def _weigh(survey: _Survey, document: _Document, place: str, name: str) -> None:
     if file is None or (document.urdf and file.suffix.lower() not in (".stl", ".obj", ".msh")):
         return
     survey.spend(_BYTES, _checked(survey, file, place).st_size, place)
-    with open(file, "rb") as opened:
-        head = opened.read(24)
+    try:
+        with open(file, "rb") as opened:
+            head = opened.read(24)
+    except OSError:
+        return  # missing to MuJoCo too
     if head.startswith(b"\x89PNG") and len(head) == 24:
         width, height = struct.unpack(">II", head[16:])
         survey.spend("pixels of textures", width * height, place)
