@@ -1,7 +1,6 @@
 # make lab: everything from nothing to open notebooks.   make test: the same set-up, then all tests.
 
 VENV := .venv
-STAMP := $(VENV)/.complete
 PY := $(VENV)/bin/python
 SCALE ?= reduced
 NOTEBOOKS ?= $(wildcard notebooks/*.ipynb)
@@ -27,18 +26,17 @@ help:
 	@echo "make clean       remove $(VENV) and caches"
 	@echo "PYTHON=/path/to/python3.12 chooses the interpreter (3.11, 3.12 or 3.13)"
 
-venv: $(STAMP)
+# PYTHON reaches the script through the environment: no shell reads quotes or spaces in it. It looks
+# each time, in half a second, as an interpreter or a package can be gone after an upgrade.
+venv:
+	@sh .ci/make_venv.sh $(VENV)
 
-$(STAMP): environment.lock pyproject.toml
-	@PYTHON="$(PYTHON)" sh .ci/make_venv.sh $(VENV)
-	@touch $@
-
-lab: $(STAMP)
+lab: venv
 	$(PY) -m jupyterlab --ServerApp.root_dir=. --LabApp.default_url=/lab/tree/notebooks \
 		$$(test "$$(id -u)" = 0 && echo --allow-root) $(LAB_ARGS)
 
 # Both parts run even if the first one fails.
-test: $(STAMP)
+test: venv
 	@status=0; \
 	$(PY) -m pytest tests $(PYTEST_ARGS) || status=$$?; \
 	if [ -n "$(NOTEBOOKS)" ]; then \
@@ -47,14 +45,14 @@ test: $(STAMP)
 	fi; \
 	exit $$status
 
-notebooks: $(STAMP)
+notebooks: venv
 	SHAPEBODY_SCALE=$(SCALE) $(PY) -m shapebody.notebooks $(NOTEBOOKS)
 
-lint: $(STAMP)
+lint: venv
 	$(PY) -m ruff check .
 	$(PY) -m ruff format --check .
 
-bench: $(STAMP)
+bench: venv
 	@set -e; for file in benchmarks/*.py; do \
 		if [ -e "$$file" ]; then echo "== $$file"; $(PY) "$$file"; fi; \
 	done

@@ -1,8 +1,17 @@
 #!/bin/sh
 # make_venv.sh FOLDER: a virtual environment with exactly environment.lock and this package, editable.
+# Does nothing if it is there, complete and not older than environment.lock; else makes or repairs it.
 # Uses uv when it is on the PATH, otherwise plain venv and pip. PYTHON chooses the interpreter.
 set -eu
 venv=$1
+stamp=$venv/.complete
+
+if [ -f "$stamp" ] && [ -x "$venv/bin/python" ] &&
+    [ -z "$(find environment.lock pyproject.toml -newer "$stamp")" ] &&
+    "$venv/bin/python" -I .ci/check_venv.py "$stamp"; then
+    exit 0
+fi
+rm -f "$stamp"
 
 fits() {
     "$1" -c 'import sys; sys.exit(not (3, 11) <= sys.version_info[:2] < (3, 14))' 2>/dev/null
@@ -19,7 +28,7 @@ and run make again (PYTHON=/path/to/python3.12 names it where it is not found).'
 
 found=""
 if [ -n "${PYTHON:-}" ]; then
-    command -v "$PYTHON" >/dev/null || fail "PYTHON=$PYTHON does not exist."
+    command -v -- "$PYTHON" >/dev/null || fail "PYTHON=$PYTHON does not exist."
     fits "$PYTHON" || fail "PYTHON=$PYTHON is $("$PYTHON" -V 2>&1); shapebody needs 3.11, 3.12 or 3.13.
 $install_hint"
     found=$PYTHON
@@ -61,6 +70,7 @@ if [ -n "$uv" ]; then
 else
     quiet=""
     [ -z "${CI:-}" ] || quiet="--quiet"
+    "$venv/bin/python" -m pip --version >/dev/null 2>&1 || "$venv/bin/python" -m ensurepip
     "$venv/bin/python" -m pip install $quiet --disable-pip-version-check --require-hashes \
         -r environment.lock
     "$venv/bin/python" -m pip install --quiet --disable-pip-version-check --no-deps \
@@ -68,3 +78,4 @@ else
 fi
 "$venv/bin/python" -c 'import jax, mujoco, shapebody; print(
     f"shapebody {shapebody.__version__} with jax {jax.__version__} and mujoco {mujoco.__version__}")'
+"$venv/bin/python" -I .ci/check_venv.py "$stamp" --write

@@ -16,6 +16,7 @@ from shapebody.assets import check_lost, drop_unreadable, find_meshes, parsed_ur
 from shapebody.feet import sole_beside
 from shapebody.finite import written
 from shapebody.foot_shapes import add_foot, is_tall
+from shapebody.guard import admit, require_writable
 from shapebody.specs import (
     FOOT,
     MESHES,
@@ -41,8 +42,10 @@ _GEOM, _JOINT = mujoco.mjtGeom, mujoco.mjtJoint
 def read(path: Path) -> tuple[str, mujoco.MjSpec, mujoco.MjModel, list[str]]:
     """Text, spec, compiled model and first notes of an MJCF or URDF file.
 
-    Raises ValueError, naming the fix, for a file that is no text, empty, cut off or not valid.
+    Raises ValueError, naming the fix, for a file that is no text, empty, cut off or not valid, and
+    for one that MuJoCo should not be given (`shapebody.guard`).
     """
+    admit(path)
     try:
         text = path.read_bytes().decode("utf-8-sig")
     except UnicodeDecodeError as error:
@@ -85,6 +88,7 @@ def read(path: Path) -> tuple[str, mujoco.MjSpec, mujoco.MjModel, list[str]]:
         kind = "URDF" if urdf else "MJCF"
         reason = _explained(error, kind, text)
         raise ValueError(f"{path} is not a valid {kind} file: {reason}") from error
+    require_writable(path, model)
     check_lost(path, model, lost, "link" if urdf else "body")
     if re.search(r"<include\s", shown):
         notes.append("other files are included: their text is merged into the completed file")

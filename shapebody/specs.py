@@ -1,5 +1,6 @@
 """Small edits of an MjSpec that keep what refers to the edited elements."""
 
+import itertools
 import re
 
 import mujoco
@@ -15,7 +16,7 @@ MESHES = tuple(map(int, (_GEOM.mjGEOM_MESH, _GEOM.mjGEOM_HFIELD, _GEOM.mjGEOM_SD
 
 def unused(name: str, taken) -> str:
     """The name, with a number if it is taken."""
-    candidates = [name, *(f"{name}_{i}" for i in range(2, len(taken) + 3))]
+    candidates = itertools.chain([name], (f"{name}_{i}" for i in itertools.count(2)))
     return next(candidate for candidate in candidates if candidate not in taken)
 
 
