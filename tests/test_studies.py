@@ -13,7 +13,7 @@ from tiny import quick_compilation, tiny_agent, tiny_robot
 from shapebody import experiments, paper, studies
 from shapebody.checkpoints import load_agent
 from shapebody.design import DesignSpace
-from shapebody.evaluation import EvaluationConfig, evaluate
+from shapebody.evaluation import EvaluationConfig, evaluate, paired_gain
 from shapebody.locomotion import TaskConfig
 from shapebody.paths import data_dir
 from shapebody.robots import load_robot
@@ -225,54 +225,75 @@ def test_available_runs_are_installed_or_stored(results, agent, robot, monkeypat
     assert studies.available(agent, robot, runs, **SETTING) == (CONTROL, runs[2])
 
 
-def test_readme_states_the_stored_results():
-    """The table of agents, row by row, from data/results."""
-    readme = (Path(__file__).parents[1] / "README.md").read_text()
+def interval(gain, digits=1):
+    return "{:+.{d}f} [{:+.{d}f}, {:+.{d}f}]".format(*gain, d=digits)
 
-    def stored(name, agent):
-        path = data_dir() / "results" / f"design_study_{name}.json"
-        assert path.exists(), f"the agent {agent.name} is shipped without its study {path.name}"
-        study = experiments.stored_result(path)
-        assert study["provenance"]["agent"]["hash"] == agent.hash, f"{path.name}: another agent"
+
+def numbers(gain):
+    return gain["mean"], gain["low"], gain["high"]
+
+
+def readme_rows(name):
+    """The rows of README's two tables for one robot, from data/results, and their episodes."""
+    robot, agent = load_robot(name), load_agent(name)
+
+    def stored(file):
+        study = experiments.stored_result(data_dir() / "results" / f"{file}_{name}.json")
+        assert study["provenance"]["agent"]["hash"] == agent.hash, f"{file}: another agent"
         return study["records"]
 
+    def returns(records, method, origin):
+        found = [r for r in records if (r["method"], r["origin"]) == (method, origin)]
+        return np.array([r["returns"] for r in found])
+
+    records = stored("design_study")
+    others = experiments.stored_result(
+        data_dir() / "results" / f"design_study_{name}_starts_from_10.json"
+    )["records"]
+    gains = {q: studies.gains(records, q) for q in ("return", "tracking_error", "length")}
+    plain = [
+        paired_gain(values, np.zeros_like(values))
+        for values in (returns(records, "none", "reference")[0], returns(records, "none", "start"))
+    ]
+    added = {q: studies.gain(gains[q], "vgds", "penalty-only", 100.0) for q in gains}
+    again = studies.gain(studies.gains(others), "vgds", "penalty-only", 100.0)
+    first = [
+        robot.display_name,
+        f"{agent.metadata['steps'] / 1e6:.1f} million",
+        *(f"{one.mean:.1f} [{one.low:.1f}, {one.high:.1f}]" for one in plain),
+        f"{paper.SINGLE_ROBOT[name]['VGDS']:+.1f}",
+        interval(numbers(studies.gain(gains["return"], "vgds", "start", 100.0))),
+        interval(numbers(added["return"])),
+        interval(numbers(again)),
+    ]
+    apart = stored("size_share")
+    base = next(np.array(r["returns"]) for r in apart if r["kept"] == "reference")
+    parts = {}
+    for kept in ("all", "size only", "all but size"):
+        mine = np.array([r["returns"] for r in apart if r["kept"] == kept])
+        parts[kept] = paired_gain(mine, np.broadcast_to(base, mine.shape))
+    second = [
+        robot.display_name,
+        interval(numbers(added["tracking_error"]), 3),
+        interval(numbers(added["length"]), 0),
+        *(interval(gain[:3]) for gain in parts.values()),
+    ]
+    episodes = [len(some[0]["returns"]) for some in (records, others, apart)]
+    return f"| {' | '.join(first)} |", f"| {' | '.join(second)} |", episodes, added, parts
+
+
+def test_readme_states_the_stored_results():
+    """The tables of agents, row by row, from data/results, and the sentences that go with them."""
+    readme = (Path(__file__).parents[1] / "README.md").read_text()
+    text = " ".join(readme.split())
+    episodes = {}
     for name in experiments.trained_robots(paper.ROBOTS):
-        robot, agent = load_robot(name), load_agent(name)
-        records, others = stored(name, agent), stored(f"{name}_starts_from_10", agent)
-        before = {
-            origin: np.mean(
-                [r["return"] for r in records if (r["method"], r["origin"]) == ("none", origin)]
-            )
-            for origin in ("reference", "start")
-        }
-        gains = studies.gains(records)
-        ours = (
-            studies.gain(gains, "vgds", "start", 100.0),
-            studies.gain(gains, "vgds", "penalty-only", 100.0),
-            studies.gain(studies.gains(others), "vgds", "penalty-only", 100.0),
-        )
-        row = (
-            f"| {robot.display_name} | {agent.metadata['steps'] / 1e6:.1f} million "
-            f"| {before['reference']:.1f} | {before['start']:.1f} "
-            f"| {paper.SINGLE_ROBOT[name]['VGDS']:+.1f} "
-            + "".join(f"| {r['mean']:+.1f} [{r['low']:+.1f}, {r['high']:+.1f}] " for r in ours)
-            + "|"
-        )
-        assert row in readme, f"README.md should have: {row}"
-        assert [len(some[0]["returns"]) for some in (records, others)] == [200, 50]
-    shares = {}
-    for name in ("unitree_go2", "golem"):
-        study = experiments.stored_result(data_dir() / "results" / f"size_share_{name}.json")
-        returns = {}
-        for record in study["records"]:
-            returns.setdefault(record["kept"], []).append(np.mean(record["returns"]))
-        base, whole, size = (np.mean(returns[x]) for x in ("reference", "all", "size only"))
-        shares[name] = (size - base) / (whole - base)
-    assert (
-        "For the Go2 that is mostly the size of the body, for the Golem mostly the rest" in readme
-    )
-    assert shares["unitree_go2"] > 0.5 > shares["golem"]
-    assert "over starts and episodes (200; 50 in the last column)" in readme.replace("\n", " ")
+        first, second, episodes[name], *_ = readme_rows(name)
+        for row in (first, second):
+            assert row in readme, f"README.md should have: {row}"
+    for name, (study, others, apart) in episodes.items():
+        assert study == apart and others == 50
+        assert f"{study} for the {load_robot(name).display_name}" in text
 
 
 def test_stored_results_belong_to_the_shipped_agents():
