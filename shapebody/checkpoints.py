@@ -515,15 +515,17 @@ def read_metadata(folder: Path) -> dict | None:
 
     Raises ValueError if its description is damaged.
     """
-    if not current(folder, DESCRIPTION).exists():
+    path = current(folder, DESCRIPTION)
+    if not path.exists():
         return None
-    metadata = _read_description(folder).get("metadata")
+    restore = _restore(folder)
+    # Of any format: what later ones hold of this is as likely the same.
+    document = read_json(path, restore)
+    metadata = document.get("metadata") if isinstance(document, dict) else None
     try:
         _check_metadata(metadata)
     except ValueError as error:
-        raise ValueError(
-            f"{folder / DESCRIPTION} is not a valid agent description ({error}); {_restore(folder)}"
-        ) from error
+        raise ValueError(f"{path} is not a valid agent description ({error}); {restore}") from error
     return metadata
 
 

@@ -32,7 +32,7 @@ def atomic_write(path: str | Path, data: bytes | str) -> Path:
     path, if the disk is full or the folder cannot be written; the old file is then as it was.
     """
     path = Path(path)
-    try:
+    with names_path(path):
         path.parent.mkdir(parents=True, exist_ok=True)
         _remove_leftovers(path)
         handle, temporary = _temporary(path)
@@ -43,11 +43,18 @@ def atomic_write(path: str | Path, data: bytes | str) -> Path:
                 os.replace(temporary, path)
         finally:
             temporary.unlink(missing_ok=True)
+    return path
+
+
+@contextlib.contextmanager
+def names_path(path: Path):
+    """Errors of the operating system in the block, such as a full disk, name this path."""
+    try:
+        yield
     except OSError as error:
         if error.errno is None or error.filename == str(path):
             raise
         raise OSError(error.errno, error.strerror, str(path)) from error
-    return path
 
 
 def _write(file, data: bytes | str) -> None:
@@ -145,8 +152,7 @@ def replace_together(folder: Path, files: Mapping[str, bytes], removed: Iterable
     their places. A process that is killed at any moment leaves all the old files or all the new.
     Raises OSError, which names the folder, if they cannot be written.
     """
-    folder.mkdir(parents=True, exist_ok=True)
-    with locked(folder / "agent"):
+    with names_path(folder), locked(folder / "agent"):
         settle(folder, alone=True)
         for leftover in folder.glob(".agent.*.tmp"):
             if leftover.is_dir():  # of a killed process, since nobody else holds the lock
@@ -164,10 +170,6 @@ def replace_together(folder: Path, files: Mapping[str, bytes], removed: Iterable
                 os.replace(stage, folder / PENDING)
                 _synchronize(folder)
                 settle(folder, alone=True)
-        except OSError as error:
-            if error.errno is None:
-                raise
-            raise OSError(error.errno, error.strerror, str(folder)) from error
         finally:
             shutil.rmtree(stage, ignore_errors=True)
 
