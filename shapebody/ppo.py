@@ -59,7 +59,14 @@ from shapebody.networks import (
 from shapebody.paths import data_dir
 from shapebody.robots import find, load_robot
 from shapebody.runtime import keep_memory
-from shapebody.stored import ARRAYS_LIMIT, read_json, read_number, read_text, require_folder_name
+from shapebody.stored import (
+    ARRAYS_LIMIT,
+    read_json,
+    read_number,
+    read_text,
+    require_folder_name,
+    shortened,
+)
 from shapebody.stored import from_plain as _from_plain
 from shapebody.stored import plain as _plain
 
@@ -1082,7 +1089,9 @@ def _begin_annealing(
     done = _iterations(folder)
     phases = _phases(folder / "training.json")
     # Checked, but kept as it was written: the copy continues from it.
-    _from_plain(TrainConfig, phases[-1]["config"], f"the configuration in {folder}/training.json")
+    _from_plain(
+        TrainConfig, phases[-1].get("config"), f"the configuration in {folder}/training.json"
+    )
     config = dict(phases[-1]["config"])
     batch = config["num_envs"] * config["rollout_length"]
     first, last = config["learning_rate"]
@@ -1259,7 +1268,7 @@ def as_continued(config: TrainConfig, folder=None) -> TrainConfig:
     if not (folder / "training.safetensors").exists():
         return config
     try:
-        last = _from_plain(TrainConfig, _phases(folder / "training.json")[-1]["config"])
+        last = _from_plain(TrainConfig, _phases(folder / "training.json")[-1].get("config"))
     except (OSError, ValueError):
         return config  # nothing to continue, or a damaged file, which `Trainer.start` reports
 
@@ -1302,8 +1311,8 @@ def _phases(path: Path) -> list[dict]:
             for name, kind in kinds.items():
                 if not isinstance(phase.get(name, kind()), kind):
                     raise ValueError(f"{name} of a phase is of another kind than {kind.__name__}")
-        if "config" not in phases[-1]:
-            raise ValueError("the last phase has no config")
+            if phase.get("engine", "native") not in ("native", "mjx"):
+                raise ValueError(f"the engine is {shortened(phase['engine'])}")
     except ValueError as error:
         raise ValueError(
             f"{path.name} is missing or damaged ({error}); it says how the run in {path.parent} "
@@ -1345,7 +1354,7 @@ def _continued(path: Path, config: TrainConfig, steps: int, robots=()) -> list[d
     phases = _phases(path)
     try:
         # Settings that are newer than the run are at their defaults in it.
-        last = _from_plain(TrainConfig, phases[-1]["config"], "config")
+        last = _from_plain(TrainConfig, phases[-1].get("config"), "config")
     except ValueError as error:
         raise ValueError(
             f"{path.name} of the run in {path.parent} is damaged, or has settings that this "
@@ -1448,6 +1457,8 @@ class _Curve:
             os.replace(path, kept)
             print(f"{path} was damaged: kept as {kept.name}, {len(rows)} rows could be read")
         rows = [row for row in rows if int(row["steps"]) <= steps]
+        # Of rows that are there twice, the first.
+        rows = list({int(row["steps"]): row for row in reversed(rows)}.values())[::-1]
         text = io.StringIO(newline="")
         writer = csv.DictWriter(text, CURVE)
         writer.writeheader()
