@@ -1,4 +1,4 @@
-"""Trained agents on disk. No pickle; the files of an agent are replaced together.
+"""Trained agents on disk. No pickle; the files of an agent are replaced together, or none is.
 
 An agent is a folder:
 
@@ -8,7 +8,8 @@ An agent is a folder:
     curve.csv             the learning curve (absent if it was not recorded)
 
 `agent.json` holds SHA-256 hashes of weights, states and the network configurations, so that a file
-that was cut off, edited or left over from another agent is noticed.
+that was cut off, edited or left over from another agent is noticed. For the moment of a save, new
+files may lie in a folder `.agent.new` beside the old ones (`files.replace_together`).
 """
 
 from __future__ import annotations
@@ -21,11 +22,10 @@ import hashlib
 import importlib.metadata
 import io
 import json
+import math
 import os
 import platform
 import subprocess
-import zipfile
-import zlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -38,12 +38,14 @@ import safetensors.numpy
 from .checks import require_kind
 from .descriptions import Descriptions, Sizes
 from .files import (
+    PENDING,
     atomic_write,
-    atomic_write_all,
+    current,
     load_arrays,
     read_curve,
-    read_safetensors,
+    replace_together,
     save_arrays,
+    settle,
 )
 from .locomotion.observations import Observation
 from .networks import (
@@ -58,6 +60,16 @@ from .networks import (
     initialize,
 )
 from .paths import data_dir
+from .stored import (
+    ARRAYS_LIMIT,
+    from_plain,
+    read_json,
+    read_npz,
+    read_safetensors,
+    require_file,
+    require_folder_name,
+    shortened,
+)
 
 __all__ = [
     "Agent",
@@ -74,8 +86,12 @@ __all__ = [
 ]
 
 FORMAT = 1
+WIDTH_LIMIT, LAYER_LIMIT, PART_LIMIT = 65_536, 64, 10_000
+"""Largest width and number of layers of a network, and largest number of joints, feet or spheres:
+far beyond what can be trained, and small enough to be refused before memory runs out."""
 WEIGHTS, DESCRIPTION, STATES, CURVE = "weights.safetensors", "agent.json", "states.npz", "curve.csv"
 _CONFIGURATION = ("robots", "sizes", "policy_config", "critic_config")
+_OTHERS = ("name", "hash", "states_hash", "configuration_hash", "metadata")
 _PACKAGES = ("shapebody", "jax", "flax", "optax", "mujoco", "numpy", "cma")
 _EXTRA_PACKAGES = ("torch", "gpytorch", "botorch")  # of the extra `bo`
 
@@ -220,9 +236,10 @@ def require_agent(agent) -> None:
 
 def agents() -> list[str]:
     """Names of the agents in `data/checkpoints`, sorted."""
-    return sorted(
-        path.parent.name for path in (data_dir() / "checkpoints").glob(f"*/{DESCRIPTION}")
-    )
+    folder = data_dir() / "checkpoints"
+    found = [path.parent for path in folder.glob(f"*/{DESCRIPTION}")]
+    found += [path.parent.parent for path in folder.glob(f"*/{PENDING}/{DESCRIPTION}")]
+    return sorted({path.name for path in found})
 
 
 def save_agent(
@@ -230,7 +247,9 @@ def save_agent(
     folder: str | Path | None = None,
     curve: Sequence[Mapping[str, Any]] | None = None,
 ) -> Path:
-    """Write an agent and return its folder. An interruption leaves the agent that was there.
+    """Write an agent and return its folder.
+
+    An interruption, even a kill at any moment, leaves the agent that was there or the new one.
 
     Args:
         agent: the agent; versions, commit and machine are added to its metadata where missing.
@@ -243,6 +262,8 @@ def save_agent(
     """
     check_agent(agent)
     folder = data_dir() / "checkpoints" / agent.name if folder is None else Path(folder)
+    if folder.exists() and not folder.is_dir():
+        raise ValueError(f"folder is {str(folder)!r}, a file; give the name of a folder")
     weights = _flat_weights(agent)
     states = _flat_states(agent)
     configuration = {
@@ -267,25 +288,23 @@ def save_agent(
             f"metadata of agent {agent.name!r} cannot be written as JSON ({error}); use numbers, "
             "strings, lists and dictionaries, and None instead of NaN"
         ) from error
-    files = {folder / WEIGHTS: safetensors.numpy.save(weights)}
+    files = {WEIGHTS: safetensors.numpy.save(weights)}
     if states is not None:
         buffer = io.BytesIO()
         np.savez_compressed(buffer, **states)
-        files[folder / STATES] = buffer.getvalue()
+        files[STATES] = buffer.getvalue()
     if curve is not None:
-        files[folder / CURVE] = _csv(curve)
-    # The description comes last: loading reports what does not match it.
-    files[folder / DESCRIPTION] = text
-    atomic_write_all(files)
-    if states is None:
-        (folder / STATES).unlink(missing_ok=True)
+        files[CURVE] = _csv(curve)
+    files[DESCRIPTION] = text
+    replace_together(folder, files, removed=() if states is not None else (STATES,))
     return folder
 
 
 def load_agent(name_or_folder: str | Path) -> Agent:
     """Load an agent by name from `data/checkpoints`, or from a folder.
 
-    A Path, or a string with a path separator in it, is a folder; any other string is a name.
+    A Path, or a string with a path separator in it, is a folder; any other string is a name. An
+    agent that is loaded by name has that name, whatever its file says: it may be a copy.
 
     Raises:
         ValueError: for an unknown name (the known ones are listed); for files that are cut off,
@@ -293,45 +312,96 @@ def load_agent(name_or_folder: str | Path) -> Agent:
         FileNotFoundError: for a missing folder or file.
     """
     folder = agent_folder(name_or_folder)
-    document = _read_description(folder)
-    restore = f"restore the folder, for example with 'git checkout -- {folder}', or train anew"
+    settle(folder)
+    while True:
+        before = _seen(folder)
+        try:
+            agent = _load(folder)
+            break
+        except (ValueError, FileNotFoundError):
+            # Files of two agents do not fit, if another process has saved one in between.
+            if _seen(folder) == before:
+                raise
+    known = folder.parent == data_dir() / "checkpoints"
+    return dataclasses.replace(agent, name=folder.name) if known else agent
+
+
+def _seen(folder: Path):
+    """What changes whenever an agent is saved in a folder."""
     try:
-        sizes = Sizes(**document["sizes"])
-        policy_config = PolicyConfig(**document["policy_config"])
-        critic_config = CriticConfig(**document["critic_config"])
-        name, robots = document["name"], tuple(document["robots"])
-        weights_hash, states_hash = document["hash"], document["states_hash"]
-        metadata, configuration_hash = document["metadata"], document["configuration_hash"]
-        if not isinstance(metadata, dict) or not isinstance(metadata.get("steps", 0), int):
-            raise TypeError("metadata is no object, or its steps are no integer")
-    except (KeyError, TypeError, ValueError) as error:
+        status = current(folder, DESCRIPTION).stat()
+        return status.st_ino, status.st_mtime_ns, status.st_size
+    except FileNotFoundError:
+        return None
+
+
+def _load(folder: Path) -> Agent:
+    document = _read_description(folder)
+    restore = _restore(folder)
+    try:
+        missing = [x for x in (*_CONFIGURATION, *_OTHERS) if x not in document]
+        if missing:
+            raise ValueError(f"{missing[0]} is missing")
+        sizes = from_plain(Sizes, document["sizes"], "sizes")
+        policy_config = from_plain(PolicyConfig, document["policy_config"], "policy_config")
+        critic_config = from_plain(CriticConfig, document["critic_config"], "critic_config")
+        name, robots, metadata = (document[x] for x in ("name", "robots", "metadata"))
+        require_folder_name("name", name)
+        if not isinstance(robots, list) or not all(isinstance(x, str) and x for x in robots):
+            raise ValueError(f"robots is {shortened(robots)}; expected a list of names")
+        for kind in ("hash", "states_hash", "configuration_hash"):
+            if not isinstance(document[kind], str | None if kind == "states_hash" else str):
+                raise ValueError(f"{kind} is {shortened(document[kind])}; expected a text")
+        _check_metadata(metadata)
+        _check_sizes(sizes, policy_config, critic_config)
+    except (TypeError, ValueError) as error:
         raise ValueError(
-            f"{folder / DESCRIPTION} is not a valid agent description "
-            f"({type(error).__name__}: {error}); {restore}"
+            f"{folder / DESCRIPTION} is not a valid agent description ({error}); {restore}"
         ) from error
 
-    weights = read_safetensors(folder / WEIGHTS, restore)
-    variables = {}
-    for role, module in (("policy", Policy(policy_config)), ("critic", Critic(critic_config))):
-        own = {k.removeprefix(f"{role}/"): v for k, v in weights.items() if k.startswith(role)}
-        _check_shapes(own, _expected(module), f"{folder / WEIGHTS} ({role})", restore)
-        variables[role] = _nest(own)
-    if _hash(weights) != weights_hash:
+    modules = {"policy": Policy(policy_config), "critic": Critic(critic_config)}
+
+    def check(header):
+        for role, module in modules.items():
+            own = {k.removeprefix(f"{role}/"): v for k, v in header.items() if k.startswith(role)}
+            shapes = {k: shape for k, (shape, _) in own.items()}
+            _check_shapes(shapes, _expected(module), f"{folder / WEIGHTS} ({role})", restore)
+        for key, (_, dtype) in header.items():
+            if dtype != np.float32 or not key.startswith(tuple(modules)):
+                raise ValueError(
+                    f"{folder / WEIGHTS} has {shortened(key)} of type {dtype}, expected float32 "
+                    f"numbers of {' and '.join(modules)} alone; {restore}"
+                )
+
+    weights = read_safetensors(current(folder, WEIGHTS), restore, check)
+    variables = {
+        role: _nest({k.removeprefix(f"{role}/"): v for k, v in weights.items() if k[:6] == role})
+        for role in modules
+    }
+    if _hash(weights) != document["hash"]:
         raise ValueError(
             f"{folder / WEIGHTS} does not match the hash in {DESCRIPTION}: it was edited or "
             f"belongs to another agent; {restore}"
         )
+    states_hash = document["states_hash"]
     states, state_robots = None, None
-    if states_hash is None and (folder / STATES).exists():
+    if states_hash is None and current(folder, STATES).exists():
         raise ValueError(
             f"{DESCRIPTION} says that the agent has no state bank, but there is {folder / STATES}: "
             f"{DESCRIPTION} was edited, or the other file is of another agent; {restore}"
         )
     if states_hash is not None:
-        states, state_robots = _read_states(folder / STATES, states_hash, restore)
+        arrays = read_npz(current(folder, STATES), _state_shapes(sizes), restore)
+        if _hash(arrays) != states_hash:
+            raise ValueError(
+                f"{folder / STATES} does not match the hash in {DESCRIPTION}: it was edited or "
+                f"belongs to another agent; {restore}"
+            )
+        state_robots = arrays.pop("state_robots")
+        states = Observation(**arrays)
     agent = Agent(
         name=name,
-        robots=robots,
+        robots=tuple(robots),
         sizes=sizes,
         policy_config=policy_config,
         critic_config=critic_config,
@@ -341,9 +411,15 @@ def load_agent(name_or_folder: str | Path) -> Agent:
         state_robots=state_robots,
         metadata=metadata,
     )
-    check_agent(agent)
+    try:
+        check_agent(agent)
+    except ValueError as error:
+        raise ValueError(
+            f"the files in {folder} do not fit together: {error}; {restore}"
+        ) from error
     # Other settings of the same shapes would make other networks of the same weights.
-    if _text_hash({name: document[name] for name in _CONFIGURATION}) != configuration_hash:
+    stored = {name: document[name] for name in _CONFIGURATION}
+    if _text_hash(stored) != document["configuration_hash"]:
         raise ValueError(
             f"{', '.join(_CONFIGURATION)} in {folder / DESCRIPTION} do not match their hash: the "
             f"file was edited; {restore}"
@@ -356,39 +432,42 @@ def load_curve(name_or_folder: str | Path) -> dict[str, np.ndarray]:
 
     Raises FileNotFoundError if the agent has none.
     """
-    path = agent_folder(name_or_folder) / CURVE
-    if not path.is_file():
+    path = current(agent_folder(name_or_folder), CURVE)
+    if not path.exists():
         raise FileNotFoundError(f"{path} does not exist: this agent has no learning curve")
     return read_curve(path)
 
 
 def check_agent(agent: Agent) -> None:
-    """Raise ValueError if the parts of an agent do not fit together."""
+    """Raise ValueError if the parts of an agent do not fit together, or are too large."""
+    require_folder_name("the agent's name", agent.name)
+    _check_sizes(agent.sizes, agent.policy_config, agent.critic_config)
     if not agent.robots:
         raise ValueError(f"agent {agent.name!r} names no robots; give at least one")
     for role, module, variables in (
         ("policy", agent.policy_module, agent.policy),
         ("critic", agent.critic_module, agent.critic),
     ):
-        flat = _flatten(variables)
+        flat = {name: np.shape(x) for name, x in _flatten(variables).items()}
         fix = f"initialize the {role} with its own configuration"
         _check_shapes(flat, _expected(module), f"{role} of agent {agent.name!r}", fix)
     if agent.states is None:
         return
-    count = agent.num_states
-    expected = {
-        "joints": (count, agent.sizes.joints, JOINT_OBSERVATION),
-        "feet": (count, agent.sizes.feet, FOOT_OBSERVATION),
-        "general": (count, GENERAL),
-        "privileged": (count, PRIVILEGED),
-    }
-    for name, shape in expected.items():
-        found = np.shape(getattr(agent.states, name))
-        if found != shape or count == 0:
+    count, total = agent.num_states, 0
+    for name, (shape, dtype) in _state_shapes(agent.sizes).items():
+        shape = (count, *shape[1:])
+        total += math.prod(shape) * np.dtype(dtype).itemsize
+        found = np.shape(getattr(agent.states, name, agent.state_robots))
+        if (found != shape or count == 0) and name != "state_robots":
             raise ValueError(
                 f"states.{name} of agent {agent.name!r} has shape {found}, expected {shape} with "
                 "at least one state; pad observations to the agent's sizes"
             )
+    if total > ARRAYS_LIMIT:
+        raise ValueError(
+            f"the state bank of agent {agent.name!r} has {total:,} bytes, expected at most "
+            f"{ARRAYS_LIMIT:,}; keep fewer states"
+        )
     owners = agent.state_robots
     if (
         np.shape(owners) != (count,)
@@ -404,13 +483,19 @@ def check_agent(agent: Agent) -> None:
 
 def agent_folder(name_or_folder: str | Path) -> Path:
     """The folder of an agent that is given as in `load_agent`; raises what that raises."""
+    if not isinstance(name_or_folder, str | Path):
+        raise TypeError(
+            f"the agent is {shortened(name_or_folder)}; expected a name or a folder, as a text or "
+            "Path"
+        )
     text = str(name_or_folder)
     if isinstance(name_or_folder, Path) or os.sep in text or "/" in text:
         folder = Path(name_or_folder).expanduser()
-        if not folder.is_dir():
+        if not os.path.isdir(folder):
             raise FileNotFoundError(
-                f"agent folder {text!r} does not exist (looked at {folder.absolute()}): give an "
-                "existing folder, or one of the names of shapebody.checkpoints.agents()"
+                f"agent folder {shortened(text)} does not exist (looked at "
+                f"{os.path.abspath(folder)[:300]}): give an existing folder, or one of the names "
+                "of shapebody.checkpoints.agents()"
             )
         return folder
     known = agents()
@@ -419,58 +504,113 @@ def agent_folder(name_or_folder: str | Path) -> Path:
         hint = f"; did you mean {close[0]!r}?" if close else "."
         listing = ", ".join(known) if known else "none"
         raise ValueError(
-            f"there is no agent {text!r} in {data_dir() / 'checkpoints'}{hint} "
+            f"there is no agent {shortened(text)} in {data_dir() / 'checkpoints'}{hint} "
             f"Available agents: {listing}"
         )
     return data_dir() / "checkpoints" / text
 
 
-def _read_description(folder: Path) -> dict:
-    path = folder / DESCRIPTION
-    if not path.is_file():
-        raise FileNotFoundError(
-            f"{path} does not exist: {folder} is no agent, or its files were copied incompletely"
-        )
+def read_metadata(folder: Path) -> dict | None:
+    """Metadata of the agent in a folder without its arrays; None if there is no agent.
+
+    Raises ValueError if its description is damaged.
+    """
+    path = current(folder, DESCRIPTION)
+    if not path.exists():
+        return None
+    restore = _restore(folder)
+    # Of any format: what later ones hold of this is as likely the same.
+    document = read_json(path, restore)
+    metadata = document.get("metadata") if isinstance(document, dict) else None
     try:
-        document = json.loads(path.read_text(encoding="utf-8"))
-        number = document["format"]
-    except (ValueError, KeyError, TypeError) as error:
-        raise ValueError(
-            f"{path} is not a valid agent description ({type(error).__name__}: {error}); restore "
-            "the file or train anew"
-        ) from error
+        _check_metadata(metadata)
+    except ValueError as error:
+        raise ValueError(f"{path} is not a valid agent description ({error}); {restore}") from error
+    return metadata
+
+
+def _restore(folder: Path) -> str:
+    return f"restore the folder, for example with 'git checkout -- {folder}', or train anew"
+
+
+def _read_description(folder: Path) -> dict:
+    path = current(folder, DESCRIPTION)
+    require_file(path, f"{folder} is no agent, or its files were copied incompletely")
+    restore = _restore(folder)
+    try:
+        document = read_json(path, restore)
+        if not isinstance(document, dict) or "format" not in document:
+            raise ValueError(f"it holds {shortened(document)} without a format; {restore}")
+    except ValueError as error:
+        raise ValueError(f"{path} is not a valid agent description: {error}") from error
+    number = document["format"]
     if number != FORMAT:
         raise ValueError(
-            f"{path} has format {number!r}, expected {FORMAT}; use the version of shapebody that "
-            "wrote it, or train anew"
+            f"{path} has format {shortened(number)}, expected {FORMAT}; use the version of "
+            "shapebody that wrote it, or train anew"
         )
     return document
 
 
-def _read_states(path: Path, expected_hash: str, fix: str):
-    if not path.is_file():
-        raise FileNotFoundError(f"{path} does not exist; {fix}")
-    try:
-        with np.load(path, allow_pickle=False) as file:
-            arrays = {name: file[name] for name in file.files}
-        owners = arrays["state_robots"]
-        states = Observation(**{k: v for k, v in arrays.items() if k != "state_robots"})
-    except (
-        OSError,
-        KeyError,
-        TypeError,
-        ValueError,
-        EOFError,
-        zlib.error,
-        zipfile.BadZipFile,
-    ) as error:
-        raise ValueError(f"{path} is cut off or no state bank ({error}); {fix}") from error
-    if _hash(arrays) != expected_hash:
-        raise ValueError(
-            f"{path} does not match the hash in {DESCRIPTION}: it was edited or belongs to another "
-            f"agent; {fix}"
-        )
-    return states, owners
+_METADATA = {
+    "steps": (int, "an integer"),
+    "scale": (str, "a text"),
+    "engine": (str, "a text"),
+    "seconds": (int | float, "a number"),
+    "config": (dict, "an object"),
+    "phases": (list, "a list of objects"),
+    "policy_evaluation": (dict, "an object"),
+}
+"""Metadata that other parts of the package read: their kinds, where they are given."""
+
+
+def _check_metadata(metadata) -> None:
+    """ValueError if what other parts of the package read there is of another kind."""
+
+    def check(values, what):
+        if not isinstance(values, dict):
+            raise ValueError(f"{what} is {shortened(values)}; expected an object")
+        for name, (kind, words) in _METADATA.items():
+            value = values.get(name)
+            if name in values and (not isinstance(value, kind) or isinstance(value, bool)):
+                raise ValueError(f"{what}.{name} is {shortened(value)}; expected {words}")
+
+    check(metadata, "metadata")
+    check(metadata.get("policy_evaluation", {}), "metadata.policy_evaluation")
+    robots = metadata.get("config", {}).get("robots", ["?"])
+    if not (isinstance(robots, list) and robots and all(isinstance(x, str) for x in robots)):
+        raise ValueError(f"metadata.config.robots is {shortened(robots)}; expected a list of names")
+    for phase in metadata.get("phases", []):
+        if not isinstance(phase, dict) or not isinstance(phase.get("robots", {}), dict):
+            raise ValueError(f"metadata.phases has {shortened(phase)}; expected objects")
+
+
+def _check_sizes(sizes: Sizes, policy: PolicyConfig, critic: CriticConfig) -> None:
+    """ValueError for numbers that no network or robot has: memory would run out first."""
+    for what, one, most in (
+        ("sizes", sizes, PART_LIMIT),
+        ("policy_config", policy, WIDTH_LIMIT),
+        ("critic_config", critic, WIDTH_LIMIT),
+    ):
+        for name, value in dataclasses.asdict(one).items():
+            limit = LAYER_LIMIT if name == "heads" else most
+            values = value if name.endswith("widths") else (value,)
+            if len(values) > LAYER_LIMIT:
+                raise ValueError(f"{what}.{name} has {len(values)} layers, at most {LAYER_LIMIT}")
+            for x in values:
+                if isinstance(x, int | np.integer) and not 0 <= x <= limit:
+                    raise ValueError(f"{what}.{name} is {x}; expected 0 to {limit:,}")
+
+
+def _state_shapes(sizes: Sizes) -> dict[str, tuple]:
+    """Shapes (with None for the number of states) and types of a state bank's arrays."""
+    return {
+        "joints": ((None, sizes.joints, JOINT_OBSERVATION), "float32"),
+        "feet": ((None, sizes.feet, FOOT_OBSERVATION), "float32"),
+        "general": ((None, GENERAL), "float32"),
+        "privileged": ((None, PRIVILEGED), "float32"),
+        "state_robots": ((None,), "int32"),
+    }
 
 
 def _flatten(tree, prefix="") -> dict[str, Any]:
@@ -512,13 +652,15 @@ def _expected(module) -> dict[str, tuple[int, ...]]:
     return {name: leaf.shape for name, leaf in _flatten(variables).items()}
 
 
-def _check_shapes(flat: Mapping[str, Any], expected: Mapping[str, tuple], what: str, fix: str):
-    problems = [f"{name} is missing" for name in expected if name not in flat]
-    problems += [f"{name} is unknown" for name in flat if name not in expected]
+def _check_shapes(
+    shapes: Mapping[str, tuple], expected: Mapping[str, tuple], what: str, fix: str
+) -> None:
+    problems = [f"{name} is missing" for name in expected if name not in shapes]
+    problems += [f"{shortened(name)} is unknown" for name in shapes if name not in expected]
     problems += [
-        f"{name} has shape {np.shape(flat[name])}, expected {shape}"
+        f"{name} has shape {shortened(shapes[name])}, expected {shape}"
         for name, shape in expected.items()
-        if name in flat and np.shape(flat[name]) != shape
+        if name in shapes and shapes[name] != shape
     ]
     if problems:
         more = f" and {len(problems) - 3} more" if len(problems) > 3 else ""

@@ -2,6 +2,7 @@
 
 import json
 import os
+import shutil
 import time
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
@@ -9,8 +10,9 @@ from pathlib import Path
 
 import numpy as np
 
-from shapebody.files import atomic_write
+from shapebody.files import atomic_write, locked
 from shapebody.paths import data_dir
+from shapebody.stored import read_json, require_folder_name, shortened
 
 
 @dataclass(frozen=True)
@@ -73,17 +75,19 @@ def study_setting() -> dict:
 
 def trained_robots(robots) -> list[str]:
     """Those of `robots` that have a shipped agent, in that order."""
-    folder = data_dir() / "checkpoints"
-    return [name for name in robots if (folder / agent_name(name) / "agent.json").exists()]
+    from shapebody.checkpoints import agents
+
+    known = agents()
+    return [name for name in robots if agent_name(name) in known]
 
 
 def agent_name(robot: str) -> str:
     """Name of the shipped agent for a robot at the scale in force: at `full`, the one trained with
     the paper's networks where there is one. `smoke` uses the reduced agent."""
+    from shapebody.checkpoints import agents
+
     full = f"{robot}_full"
-    if scale() == "full" and (data_dir() / "checkpoints" / full / "agent.json").exists():
-        return full
-    return robot
+    return full if scale() == "full" and full in agents() else robot
 
 
 def provenance(agent=None, seconds: float | None = None, **config) -> dict:
@@ -134,9 +138,9 @@ def result_in_parts(
     """`result` for long computations: each part is stored as soon as it is done.
 
     A computation that was interrupted goes on with the first part that is missing. The file may
-    hold more parts than are asked for. A file of another agent or of other settings is not
-    overwritten: it is renamed to <name>.old.json. So is one in which a part has other settings of
-    its own; the rest of it is used.
+    hold more parts than are asked for, and other processes may add theirs meanwhile. A file of
+    another agent or of other settings is not overwritten: it is renamed to <name>.old.json. So is
+    one in which a part has other settings of its own; the rest of it is used.
 
     Args:
         name, agent, config: see `result`.
@@ -148,15 +152,17 @@ def result_in_parts(
     Returns:
         {"records": those of `parts`, in that order, "provenance": {...}}; "seconds" there is the
         sum over these parts.
+
+    Raises:
+        ValueError: for a damaged file, unless `recompute`, which keeps it as <name>.old.json.
+        OSError: if the file cannot be written; the old one stays.
     """
     path, kept = result_path(name), scale() != "smoke"
     settings = settings or {}
-    known = _known_parts(path, agent, config, recompute) if kept else {}
-    fitting = {part: known[part] for part in known if _fits(known[part], settings.get(part))}
-    another = kept and path.exists() and (not known or len(fitting) < len(known))
-    known = fitting
+    known, _ = _usable_parts(path, agent, config, settings, recompute) if kept else ({}, False)
     if recompute or parts.keys() - known.keys():
         provenance()  # reads the commit of the code that is about to run
+    computed = {}
     for number, (part, compute) in enumerate(parts.items(), 1):
         if part in known and not recompute:
             continue
@@ -165,21 +171,29 @@ def result_in_parts(
         source = provenance(agent, time.perf_counter() - began, **config)
         if part in settings:
             source["settings"] = settings[part]
-        known[part] = {"records": records, "provenance": source}
+        computed[part] = {"records": records, "provenance": source}
         if kept:
-            if another:
-                _set_aside(path)
-                another = False
-            atomic_write(path, _one_record_per_line(known))
+            with locked(path):
+                # Read again: another process may have added parts in the meantime.
+                stored, another = _usable_parts(path, agent, config, settings, overwrite=True)
+                _write_parts(path, known | stored | computed, another)
         if progress:
             seconds = source["seconds"]
             print(f"{number} of {len(parts)}: {part}, {seconds:.0f} s", flush=True)
+    known |= computed
     return _joined([known[part] for part in parts])
 
 
 def stored_result(path) -> dict:
-    """What `result` returned when it wrote that file."""
-    return _joined(list(json.loads(path.read_text())["parts"].values()))
+    """What `result` returned when it wrote that file.
+
+    Raises FileNotFoundError if it is missing, ValueError if it is damaged.
+    """
+    fix = "restore it, or delete it and compute it anew"
+    parts = _read_parts(Path(path), fix)
+    if not parts:
+        raise ValueError(f"{path} holds no parts; {fix}")
+    return _joined(list(parts.values()))
 
 
 def _joined(parts: list[dict]) -> dict:
@@ -191,21 +205,36 @@ def _joined(parts: list[dict]) -> dict:
     }
 
 
-def _set_aside(path) -> None:
-    number, old = 1, path.with_suffix(".old.json")
-    while old.exists():
-        number += 1
-        old = path.with_suffix(f".old{number}.json")
-    os.replace(path, old)
-    print(f"{path.name} was of another agent or other settings, or damaged: kept as {old.name}")
+def _write_parts(path: Path, parts: dict, another: bool) -> None:
+    """Write a result's file; if it was another result's, that is kept beside it.
+
+    The old file is at its place until the new one takes it, and stays if the disk is full.
+    """
+    old = None
+    if another:
+        number, old = 1, path.with_suffix(".old.json")
+        while old.exists():
+            number += 1
+            old = path.with_suffix(f".old{number}.json")
+        try:
+            os.link(path, old)
+        except OSError:  # a file system without links
+            shutil.copyfile(path, old)
+    try:
+        atomic_write(path, _one_record_per_line(parts))
+    except BaseException:
+        if old is not None:
+            old.unlink(missing_ok=True)
+        raise
+    if old is not None:
+        print(f"{path.name} was of another agent or other settings, or damaged: kept as {old.name}")
 
 
 def stored_parts(name: str, agent=None, settings=None, **config) -> list[str]:
     """Names of the parts that `result_in_parts` would load for these arguments."""
     if scale() == "smoke":
         return []
-    known = _known_parts(result_path(name), agent, config, overwrite=False)
-    return [part for part in known if _fits(known[part], (settings or {}).get(part))]
+    return list(_usable_parts(result_path(name), agent, config, settings or {}, False)[0])
 
 
 def stored_config(name: str, agent=None) -> dict | None:
@@ -217,45 +246,86 @@ def stored_config(name: str, agent=None) -> dict | None:
     if scale() == "smoke" or not path.exists():
         return None
     try:
-        part = next(iter(json.loads(path.read_text())["parts"].values()))
-        config = part["provenance"]["config"]
-        return config if _known_parts(path, agent, config, overwrite=True) else None
-    except (json.JSONDecodeError, KeyError, TypeError, AttributeError, StopIteration):
+        parts = _read_parts(path, "")
+    except ValueError:
         return None
+    config = next(iter(parts.values()))["provenance"]["config"] if parts else None
+    return config if _of_agent(parts, agent, config) else None
 
 
 def result_path(name: str) -> Path:
     """Where `result` keeps that experiment at the scale in force."""
     suffix = "" if scale() == "reduced" else f"_{scale()}"
+    name = require_folder_name("the name of the result", name)
     return data_dir() / "results" / f"{name}{suffix}.json"
 
 
-def _known_parts(path, agent, config, overwrite: bool) -> dict:
-    """The parts in a result's file, if they belong to this agent and these settings.
+def _usable_parts(path, agent, config, settings: dict, overwrite: bool) -> tuple[dict, bool]:
+    """(the parts in a result's file that belong to this agent and these settings, whether the
+    file holds anything else).
 
     A damaged file has none if it is to be overwritten anyway.
     """
-    if not path.exists():
-        return {}
-    config = json.loads(json.dumps(config))
+    if not os.path.lexists(path):
+        return {}, False
     try:
-        known = json.loads(path.read_text())["parts"]
-        for part in known.values():
-            source, _ = part["provenance"], part["records"]
-            same = source["config"] == config and isinstance(source["seconds"], float)
-            if agent is not None:
-                same &= source["agent"]["hash"] == agent.hash
-                same &= source["agent"]["states_hash"] == agent.states_hash
-            if not same:
-                return {}
-    except (json.JSONDecodeError, KeyError, TypeError, AttributeError) as error:
-        if overwrite:
-            return {}
-        raise ValueError(
-            f"{path.name} in data/results is damaged ({error}); delete it, or call with "
-            "recompute=True"
-        ) from error
-    return known
+        known = _read_parts(path, "delete it, or call with recompute=True")
+    except ValueError:
+        if overwrite and path.is_file():
+            return {}, True
+        raise
+    config = json.loads(json.dumps(config))
+    if not _of_agent(known, agent, config):
+        return {}, True
+    fitting = {part: one for part, one in known.items() if _fits(one, settings.get(part))}
+    return fitting, len(fitting) < len(known)
+
+
+def _of_agent(parts: dict, agent, config) -> bool:
+    """Whether all parts, at least one, are of this agent (if one is given) and these settings."""
+    agent = {} if agent is None else {"hash": agent.hash, "states_hash": agent.states_hash}
+    sources = [one["provenance"] for one in parts.values()]
+    return bool(sources) and all(
+        source["config"] == config and agent.items() <= source.get("agent", {}).items()
+        for source in sources
+    )
+
+
+def _read_parts(path: Path, fix: str) -> dict:
+    """The parts in a result's file: {name: {"records": [...], "provenance": {...}}}.
+
+    Raises FileNotFoundError if it is missing, ValueError if it is damaged.
+    """
+
+    def require(sound: bool, what: str, value, expected: str):
+        if not sound:
+            raise ValueError(f"{what} is {shortened(value)}, expected {expected}")
+
+    def listed(value, kind):
+        return isinstance(value, list) and all(isinstance(x, kind) for x in value)
+
+    # Records may hold NaN, where a number does not exist.
+    document = read_json(path, fix, finite=False)
+    try:
+        parts = document.get("parts") if isinstance(document, dict) else document
+        require(isinstance(parts, dict), "'parts'", parts, "an object")
+        for name, part in parts.items():
+            require(isinstance(part, dict), name, part, "an object")
+            require(listed(part.get("records"), dict), "records", part.get("records"), "objects")
+            source = part.get("provenance")
+            require(isinstance(source, dict), "provenance", source, "an object")
+            for key, kind, words in (
+                ("config", dict, "an object"),
+                ("seconds", float, "a number"),
+                ("agent", dict, "an object"),
+            ):
+                value = source.get(key, {} if key == "agent" else None)
+                require(isinstance(value, kind), key, value, words)
+            own = source.get("agent", {}).values()
+            require(not any(isinstance(x, list | dict) for x in own), "agent", source, "texts")
+    except ValueError as error:
+        raise ValueError(f"{path} is damaged ({error}); {fix}") from error
+    return parts
 
 
 def _fits(part: dict, settings: dict | None) -> bool:

@@ -5,49 +5,213 @@ from __future__ import annotations
 import contextlib
 import csv
 import fcntl
+import io
 import os
+import re
 import secrets
+import shutil
 import signal
 import threading
-from collections.abc import Mapping
+import time
+import zlib
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-import safetensors
 import safetensors.numpy
+
+from shapebody.stored import read_metadata, read_safetensors, read_text
 
 
 def atomic_write(path: str | Path, data: bytes | str) -> Path:
-    """Write a file so that it is never seen half-written; its folder is created if needed."""
+    """Write a file so that it is never seen half-written; its folder is created if needed.
+
+    What killed calls for the same path left behind is removed. Raises OSError, which names the
+    path, if the disk is full or the folder cannot be written; the old file is then as it was.
+    """
     path = Path(path)
-    atomic_write_all({path: data})
+    with names_path(path):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        _remove_leftovers(path)
+        handle, temporary = _temporary(path)
+        try:
+            with open(handle, "wb") as file:
+                _write(file, data)
+                # Before the file is closed, which ends the lock that says its writer is alive.
+                os.replace(temporary, path)
+        finally:
+            temporary.unlink(missing_ok=True)
     return path
 
 
-def atomic_write_all(files: Mapping[Path, bytes | str]) -> None:
-    """Write files that belong together; their folders are created if needed.
-
-    All are written under temporary names first. Then they take their places at once, in the given
-    order. An interruption before that leaves all the old files; Ctrl-C during it waits.
-    """
-    temporaries = {}
+@contextlib.contextmanager
+def names_path(path: Path):
+    """Errors of the operating system in the block, such as a full disk, name this path."""
     try:
-        for path, data in files.items():
-            path.parent.mkdir(parents=True, exist_ok=True)
-            temporary = path.with_name(f".{path.name}.{secrets.token_hex(4)}.tmp")
-            temporaries[temporary] = path
-            with open(temporary, "xb") as file:
-                file.write(data.encode() if isinstance(data, str) else data)
-                file.flush()
-                os.fsync(file.fileno())
-        with _uninterrupted():
-            for temporary, path in temporaries.items():
-                os.replace(temporary, path)
+        yield
+    except OSError as error:
+        if error.errno is None or error.filename == str(path):
+            raise
+        raise OSError(error.errno, error.strerror, str(path)) from error
+
+
+def _write(file, data: bytes | str) -> None:
+    """Write to an open file, and have it on the disk."""
+    file.write(data.encode() if isinstance(data, str) else data)
+    file.flush()
+    os.fsync(file.fileno())
+
+
+def _temporary(path: Path) -> tuple[int, Path]:
+    """A new file beside `path`, open and locked for as long as it is open."""
+    while True:
+        # Not the whole name, which may be as long as names can be.
+        name = f".{path.name[:100]}.{secrets.token_hex(4)}.tmp"
+        temporary = path.with_name(name)
+        handle = os.open(temporary, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o666)
+        _lock(handle)
+        if os.fstat(handle).st_nlink:  # else taken for a leftover before it was locked
+            return handle, temporary
+        os.close(handle)
+
+
+def _remove_leftovers(path: Path) -> None:
+    """Remove temporary files for `path` whose writers are gone: nobody holds their locks."""
+    form = re.compile(re.escape(f".{path.name[:100]}.") + r"[0-9a-f]{8}\.tmp")
+    for name in os.listdir(path.parent):
+        if form.fullmatch(name):
+            with contextlib.suppress(OSError):
+                handle = os.open(path.with_name(name), os.O_RDONLY | os.O_NONBLOCK)
+                try:
+                    if _lock(handle):
+                        os.unlink(path.with_name(name))
+                finally:
+                    os.close(handle)
+
+
+def _lock(handle: int) -> bool:
+    """Lock an open file or folder; False if somebody else has, or if it cannot be told."""
+    try:
+        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except OSError:
+        return False
+    return True
+
+
+@contextlib.contextmanager
+def locked(path: Path, patience: float = 60.0):
+    """Keep all other blocks like this for the same path waiting, in all processes.
+
+    For short work such as reading, merging and writing one file. The operating system forgets the
+    lock when the process ends, however it ends.
+
+    Raises ValueError if the others have not finished after `patience` seconds.
+    """
+    path.parent.mkdir(parents=True, exist_ok=True)
+    lock = path.with_name(f".{path.name[:100]}.lock.tmp")
+    until = time.monotonic() + patience
+    while True:
+        handle = os.open(lock, os.O_RDWR | os.O_CREAT, 0o666)
+        try:
+            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            # Whoever had it before may have removed the file.
+            with contextlib.suppress(FileNotFoundError):
+                if os.path.samestat(os.fstat(handle), os.stat(lock)):
+                    break
+        except BlockingIOError:
+            if time.monotonic() > until:
+                os.close(handle)
+                raise ValueError(
+                    f"another process has been writing {path} for {patience:.0f} s; wait for it, "
+                    "or stop it"
+                ) from None
+            time.sleep(0.01)
+        except OSError:  # a file system without locks
+            break
+        os.close(handle)
+    try:
+        yield
     finally:
-        for temporary in temporaries:
-            temporary.unlink(missing_ok=True)
+        lock.unlink(missing_ok=True)
+        os.close(handle)
+
+
+# ---------------------------------------------------------------------- files that belong together
+
+PENDING = ".agent.new"
+"""Folder with files that are on their way to their places in the folder around it."""
+
+
+def replace_together(folder: Path, files: Mapping[str, bytes], removed: Iterable[str] = ()) -> None:
+    """Replace files of a folder, and remove some, all at once; the folder is created if needed.
+
+    The new files are written to a folder of their own in it. One renaming of that folder to
+    `PENDING` makes them the valid ones: from then on, `current` finds them there until they are at
+    their places. A process that is killed at any moment leaves all the old files or all the new.
+    Raises OSError, which names the folder, if they cannot be written.
+    """
+    with names_path(folder), locked(folder / "agent"):
+        settle(folder, alone=True)
+        for leftover in folder.glob(".agent.*.tmp"):
+            if leftover.is_dir():  # of a killed process, since nobody else holds the lock
+                shutil.rmtree(leftover)
+        stage = folder / f".agent.{secrets.token_hex(4)}.tmp"
+        stage.mkdir()
+        try:
+            for name in removed:
+                (stage / f"-{name}").touch()
+            for name, data in files.items():
+                with open(stage / name, "xb") as file:
+                    _write(file, data)
+            _synchronize(stage)
+            with _uninterrupted():
+                os.replace(stage, folder / PENDING)
+                _synchronize(folder)
+                settle(folder, alone=True)
+        finally:
+            shutil.rmtree(stage, ignore_errors=True)
+
+
+def current(folder: Path, name: str) -> Path:
+    """Where a file of that folder is now, which `replace_together` may be moving."""
+    pending = folder / PENDING
+    if (pending / name).exists() or (pending / f"-{name}").exists():
+        return pending / name
+    return folder / name
+
+
+def settle(folder: Path, alone: bool = False) -> None:
+    """Finish a `replace_together` that was killed; nothing where that is impossible.
+
+    alone: the caller holds the lock, and errors are raised.
+    """
+    pending = folder / PENDING
+    if not pending.is_dir():
+        return
+    if not alone:
+        # Who only reads waits for nobody, and may have no right to write.
+        with contextlib.suppress(OSError, ValueError), locked(folder / "agent", patience=0.0):
+            settle(folder, alone=True)
+        return
+    for path in sorted(pending.iterdir()):
+        if path.name.startswith("-"):
+            (folder / path.name[1:]).unlink(missing_ok=True)
+            path.unlink()
+        else:
+            os.replace(path, folder / path.name)
+    pending.rmdir()
+
+
+def _synchronize(folder: Path) -> None:
+    """Have the names in a folder on the disk, as far as the file system does that."""
+    handle = os.open(folder, os.O_RDONLY)
+    try:
+        with contextlib.suppress(OSError):
+            os.fsync(handle)
+    finally:
+        os.close(handle)
 
 
 @contextlib.contextmanager
@@ -92,29 +256,23 @@ def alone_in(folder: str | Path):
 def read_curve(path: str | Path) -> dict[str, np.ndarray]:
     """Columns of a learning curve (`curve.csv` of an agent), float64, NaN where a cell is empty.
 
-    Raises ValueError if it holds no rows, or text where a number should be.
+    Raises FileNotFoundError if it is missing, ValueError if it is damaged: no rows, rows of another
+    length than the first, or text where a number should be.
     """
-    with open(path, newline="", encoding="utf-8") as file:
-        rows = list(csv.DictReader(file))
-    if not rows:
-        raise ValueError(f"{path} holds no rows; expected a header and one line per record")
+    path = Path(path)
+    fix = "restore it, or save the agent anew with Trainer.save_agent"
+    text = read_text(path, fix)
     try:
-        return {
-            name: np.array([float(row[name]) if row[name] else np.nan for row in rows])
-            for name in rows[0]
-        }
-    except (TypeError, ValueError) as error:
-        raise ValueError(f"{path} is no learning curve ({error})") from error
-
-
-def read_safetensors(path: Path, fix: str) -> dict[str, np.ndarray]:
-    """Arrays of a safetensors file by name; errors end with `fix`."""
-    if not path.is_file():
-        raise FileNotFoundError(f"{path} does not exist; {fix}")
-    try:
-        return safetensors.numpy.load(path.read_bytes())
-    except (safetensors.SafetensorError, KeyError, ValueError) as error:
-        raise ValueError(f"{path} is cut off or no safetensors file ({error}); {fix}") from error
+        names, *rows = [row for row in csv.reader(io.StringIO(text)) if row] or [[]]
+        if not rows:
+            raise ValueError("it holds no rows; expected a header and one line per record")
+        for row in rows:
+            if len(row) != len(names):
+                raise ValueError(f"a row of {len(row)} cells under a header of {len(names)}")
+        numbers = [[float(cell) if cell else np.nan for cell in row] for row in rows]
+    except (csv.Error, ValueError) as error:
+        raise ValueError(f"{path} is no learning curve ({error}); {fix}") from error
+    return dict(zip(names, np.array(numbers).T, strict=True))
 
 
 def save_arrays(path: str | Path, pytree) -> Path:
@@ -126,7 +284,16 @@ def save_arrays(path: str | Path, pytree) -> Path:
     Raises:
         ValueError: for a leaf of another type.
     """
-    return atomic_write(path, safetensors.numpy.save(dict(_leaves(pytree))))
+    arrays = dict(_leaves(pytree))
+    return atomic_write(path, safetensors.numpy.save(arrays, {"crc32": _checksum(arrays)}))
+
+
+def _checksum(arrays: Mapping[str, np.ndarray]) -> str:
+    """A number that almost certainly changes with any name or byte."""
+    value = 0
+    for name in sorted(arrays):
+        value = zlib.crc32(arrays[name].tobytes(), zlib.crc32(name.encode(), value))
+    return f"{value:08x}"
 
 
 def load_arrays(path: str | Path, like):
@@ -142,21 +309,24 @@ def load_arrays(path: str | Path, like):
     """
     path = Path(path)
     fix = "delete it to start anew, or use the configuration it was written with"
-    stored = read_safetensors(path, fix)
     expected = dict(_leaves(like, shapes_only=True))
-    problems = [f"{name} is missing" for name in expected if name not in stored]
-    problems += [f"{name} is unknown" for name in stored if name not in expected]
-    for name, (shape, dtype) in expected.items():
-        if name in stored and (stored[name].shape, stored[name].dtype) != (shape, dtype):
-            problems.append(
-                f"{name} is {stored[name].dtype}{list(stored[name].shape)}, expected "
-                f"{dtype}{list(shape)}"
-            )
-    if problems:
-        more = f" and {len(problems) - 3} more" if len(problems) > 3 else ""
-        raise ValueError(
-            f"{path} does not fit the state to be restored: {'; '.join(problems[:3])}{more}; {fix}"
-        )
+
+    def check(header):
+        problems = [f"{name} is missing" for name in expected if name not in header]
+        problems += [f"{name} is unknown" for name in header if name not in expected]
+        for name, (shape, dtype) in expected.items():
+            if name in header and header[name] != (shape, dtype):
+                own_shape, own = header[name]
+                problems.append(f"{name} is {own}{list(own_shape)}, expected {dtype}{list(shape)}")
+        if problems:
+            more = f" and {len(problems) - 3} more" if len(problems) > 3 else ""
+            listing = "; ".join(problems[:3]) + more
+            raise ValueError(f"{path} does not fit the state to be restored: {listing}; {fix}")
+
+    stored = read_safetensors(path, fix, check)
+    # Files that are older than the checksum have none.
+    if read_metadata(path, fix).get("crc32", _checksum(stored)) != _checksum(stored):
+        raise ValueError(f"{path} is damaged: its numbers do not match its checksum; {fix}")
 
     def restored(place, leaf):
         value = stored[_leaf_name(place)]

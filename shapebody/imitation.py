@@ -22,7 +22,8 @@ from shapebody.checkpoints import Agent, require_agent
 from shapebody.checks import require_integer
 from shapebody.locomotion import Locomotion
 from shapebody.networks import Policy
-from shapebody.ppo import TrainConfig, Trainer, _apply, _plain
+from shapebody.ppo import Failures, TrainConfig, Trainer, _apply
+from shapebody.stored import plain as _plain
 
 NOISE = 0.1
 """Standard deviation of the noise on the student's actions, in units of the action scale."""
@@ -60,42 +61,44 @@ def begin_run(
         whom it imitated.
 
     Raises:
-        ValueError: if there is a run in the folder, or the teacher is not for these robots.
+        ValueError: if there is a run in the folder, another one begins there, or the teacher is
+            not for these robots; if the simulation of a robot always fails.
     """
     require_agent(teacher)
     require_integer("steps", steps, 1)
     trainer = Trainer(config, folder, engine)
-    saved = trainer.folder / "training.safetensors"
-    if saved.exists():
-        raise ValueError(
-            f"there is a run in {trainer.folder} already; choose another name, or move "
-            f"{saved.name} away to begin anew"
-        )
     names = {robot.name for robot in trainer.env.robots}
     if names != set(teacher.robots):
         raise ValueError(
             f"the teacher {teacher.name!r} is for {', '.join(sorted(teacher.robots))}, the run for "
             f"{', '.join(sorted(names))}; give an agent for the same robots"
         )
-    task = replace(config.task, fixed_coefficient=True, design_radius=(0.0, 1.0))
-    env = Locomotion(trainer.env.robots, config.num_envs, engine, task)
-    began = time.monotonic()
-    policy, error = _imitated(config, env, teacher, trainer.learner.policy, steps, progress)
-    trainer.start()
-    learner = replace(trainer.learner, policy=policy)
-    if config.critic == teacher.critic_config:
-        learner = replace(learner, critic=jax.tree.map(jnp.asarray, teacher.critic))
-    trainer.learner, trainer.behaviour = learner, policy
-    trainer.phases[0]["imitated"] = {
-        "agent": teacher.name,
-        "policy_hash": teacher.policy_hash,
-        "policy": _plain(teacher.policy_config),
-        "agent_steps": teacher.metadata.get("steps"),
-        "steps": max(1, steps // config.batch) * config.batch,
-        "seconds": round(time.monotonic() - began, 1),
-        "squared_error": round(error, 4),
-    }
-    trainer.save()
+    with trainer.alone():
+        saved = trainer.folder / "training.safetensors"
+        if saved.exists():
+            raise ValueError(
+                f"there is a run in {trainer.folder} already; choose another name, or move "
+                f"{saved.name} away to begin anew"
+            )
+        task = replace(config.task, fixed_coefficient=True, design_radius=(0.0, 1.0))
+        env = Locomotion(trainer.env.robots, config.num_envs, engine, task)
+        began = time.monotonic()
+        policy, error = _imitated(config, env, teacher, trainer.learner.policy, steps, progress)
+        trainer.start()
+        learner = replace(trainer.learner, policy=policy)
+        if config.critic == teacher.critic_config:
+            learner = replace(learner, critic=jax.tree.map(jnp.asarray, teacher.critic))
+        trainer.learner, trainer.behaviour = learner, policy
+        trainer.phases[0]["imitated"] = {
+            "agent": teacher.name,
+            "policy_hash": teacher.policy_hash,
+            "policy": _plain(teacher.policy_config),
+            "agent_steps": teacher.metadata.get("steps"),
+            "steps": max(1, steps // config.batch) * config.batch,
+            "seconds": round(time.monotonic() - began, 1),
+            "squared_error": round(error, 4),
+        }
+        trainer.save()
     return trainer
 
 
@@ -142,11 +145,12 @@ def _imitated(config, env, teacher, variables, steps, progress):
     key = jax.random.fold_in(jax.random.PRNGKey(config.seed), 17)
     state = env.reset(key, coefficient=1.0, spread=True)
     memory, optimizer_state = deque(maxlen=KEPT), optimizer.init(variables["params"])
-    until = time.monotonic()
+    until, failures = time.monotonic(), Failures(env)
     for number in range(iterations):
         keys = jax.random.split(jax.random.fold_in(key, number), KEPT + 1)
         policies = variables, teacher.policy
         state, rollout = env.rollout(act, policies, state, keys[0], config.rollout_length)
+        failures.add(rollout)
         memory.append(
             {
                 "seen": by_env(rollout.observation),

@@ -13,17 +13,20 @@ The second phase, policy evaluation, freezes the policy and trains critics alone
 over the full design space.
 """
 
+import contextlib
 import csv
 import io
 import json
 import math
+import os
+import secrets
 import shutil
 import sys
 import time
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import asdict, dataclass, field, is_dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, get_type_hints
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -35,11 +38,12 @@ from shapebody.checkpoints import (
     atomic_write,
     load_agent,
     load_arrays,
+    read_metadata,
     save_agent,
     save_arrays,
 )
 from shapebody.checks import require_integer, require_kind
-from shapebody.files import alone_in, read_safetensors
+from shapebody.files import alone_in, names_path
 from shapebody.locomotion import Locomotion, TaskConfig, Trajectory
 from shapebody.locomotion.observations import COMMAND, Observation
 from shapebody.networks import (
@@ -53,8 +57,18 @@ from shapebody.networks import (
     standardization,
 )
 from shapebody.paths import data_dir
-from shapebody.robots import load_robot
+from shapebody.robots import find, load_robot
 from shapebody.runtime import keep_memory
+from shapebody.stored import (
+    ARRAYS_LIMIT,
+    read_json,
+    read_number,
+    read_text,
+    require_folder_name,
+    shortened,
+)
+from shapebody.stored import from_plain as _from_plain
+from shapebody.stored import plain as _plain
 
 SCALES = ("smoke", "reduced", "full")
 """Names of the sizes at which everything can be computed."""
@@ -121,10 +135,7 @@ class TrainConfig:
                 f"robots is {robots!r}; expected robots of different names: a robot is known by "
                 "the name of its file, so leave out repeated ones, or copy a file to another name"
             )
-        if not self.name or Path(self.name).name != self.name:
-            raise ValueError(
-                f"name is {self.name!r}; expected the name of a folder, without separators"
-            )
+        require_folder_name("name", self.name)
         counts = ("num_envs", "rollout_length", "total_steps", "minibatch_size", "epochs")
         for name in (*counts, "state_bank"):
             value = getattr(self, name)
@@ -254,6 +265,17 @@ def _robot_name(name_or_path) -> str:
             f"a robot is {name_or_path!r}; expected a name or the path of a file, as a text or Path"
         )
     return Path(name_or_path).stem
+
+
+def _located(robot: str) -> str:
+    """A robot as runs store it: a shipped one by name, a file by its absolute path, so that it is
+    the same robot in every working directory."""
+    try:
+        path = find(robot)
+    except (ValueError, OSError):
+        return robot  # which `load_robot` reports
+    # Links are not followed: the robot's name is that of the file as it was given.
+    return robot if path == data_dir() / "robots" / f"{robot}.xml" else os.path.abspath(path)
 
 
 def _is_number(value, high: float) -> bool:
@@ -535,7 +557,9 @@ class Trainer:
     Everything that determines its future is in `training.safetensors` in the agent's folder,
     written after every iteration: a killed run continues as if nothing had happened and
     repeats at most one rollout. Beside it, `training.csv` is the learning curve so far; the
-    agent itself and its `curve.csv` change only in `save_agent`.
+    agent itself and its `curve.csv` change only in `save_agent`. Of several trainers in a folder,
+    one writes at a time (`alone`), and none replaces a state that another has written since it
+    last read or wrote its own.
 
     Args:
         config: the run.
@@ -545,11 +569,14 @@ class Trainer:
         policy: variables of a frozen policy, for the policy-evaluation phase.
 
     Raises:
-        ValueError: if the run in the folder has another engine.
+        ValueError: if the run in the folder has another engine, or the state bank of `config` is
+            too large for the file of an agent.
     """
 
     def __init__(self, config: TrainConfig, folder=None, engine: str = "auto", policy=None):
         keep_memory()
+        robots = tuple(_located(robot) for robot in config.robots)
+        config = config if robots == config.robots else replace(config, robots=robots)
         self.config = config
         self.folder = Path(folder) if folder else data_dir() / "checkpoints" / config.name
         robots = [load_robot(name) for name in config.robots]
@@ -558,6 +585,7 @@ class Trainer:
             task = replace(task, fixed_coefficient=True)
         engine = _engine(self.folder, engine)
         self.env = Locomotion(robots, config.num_envs, engine=engine, config=task)
+        _check_state_bank(config, self.env.sizes)
         self.policy, self.critic = Policy(config.policy), Critic(config.critic)
         self.update, start = make_update(config, self.policy, self.critic)
         self.act = make_policy_function(self.policy, config.mean_actions)
@@ -573,6 +601,8 @@ class Trainer:
         self.state = None
         self.saved_physics = None
         self.in_step = True  # whether the engine is where `state` is
+        self.holds_lock = False
+        self.known = None  # `_version` of the state on disk that this trainer read or wrote
 
     def _constants(self, key):
         """Input standardization over the designs of all robots."""
@@ -599,22 +629,63 @@ class Trainer:
             "seconds": np.float64(self.seconds),
         }
 
+    @contextlib.contextmanager
+    def alone(self):
+        """Keep other trainers out of the folder while the block runs; blocks may be nested.
+
+        Raises:
+            ValueError: if another process, or another trainer, is at work there.
+        """
+        if self.holds_lock:
+            yield
+            return
+        created = not self.folder.exists()
+        self.folder.mkdir(parents=True, exist_ok=True)
+        try:
+            with alone_in(self.folder):
+                self.holds_lock = True
+                yield
+        finally:
+            self.holds_lock = False
+            if created:
+                with contextlib.suppress(OSError):  # unless something was written there
+                    self.folder.rmdir()
+
+    def _require_latest(self) -> None:
+        """ValueError if the state on disk is another than this trainer read or wrote last."""
+        if _version(self.folder) != self.known:
+            raise ValueError(
+                f"the run in {self.folder} has changed since this trainer read it: another one has "
+                "trained there; call start() to go on from its state, or choose another name or "
+                "folder"
+            )
+
     def save(self) -> None:
-        """Write the training state."""
-        path = self.folder / "training.json"
-        text = json.dumps(self.phases, indent=1) + "\n"
-        if not path.exists() or path.read_text() != text:
-            atomic_write(path, text)
-        save_arrays(self.folder / "training.safetensors", self._everything())
+        """Write the training state.
+
+        Raises:
+            ValueError: if another trainer has written one since this trainer's own.
+        """
+        with self.alone():
+            self._require_latest()
+            path = self.folder / "training.json"
+            text = json.dumps(self.phases, indent=1) + "\n"
+            if not path.exists() or path.read_bytes() != text.encode():
+                atomic_write(path, text)
+            save_arrays(self.folder / STATE_FILES[0], self._everything())
+            self.known = _version(self.folder)
 
     def start(self) -> bool:
         """Resume from the folder, or start afresh; True if resumed.
 
         Raises:
+            FileNotFoundError: if the run in the folder lacks its training.json.
             ValueError: if the run in the folder is of another configuration, or its files are
                 damaged.
         """
         path = self.folder / "training.safetensors"
+        # Before anything is read: what another trainer writes meanwhile is noticed in `run`.
+        self.known = _version(self.folder)
         resumed = path.exists()
         if resumed:
             # Before the arrays are read, whose shapes depend on the configuration.
@@ -668,8 +739,8 @@ class Trainer:
         """
         folder = Path(folder) if folder else self.folder
         agent = self.agent(self.state_bank())
-        curve = self.folder / "training.csv"
-        save_agent(agent, folder, _rows(curve) if curve.exists() else None)
+        rows, _ = _rows(self.folder / "training.csv")
+        save_agent(agent, folder, rows or None)
         return agent
 
     # -------------------------------------------------------------- the loop
@@ -693,13 +764,13 @@ class Trainer:
             curve_interval: iterations per row of the learning curve, CURVE_INTERVAL if not given.
 
         Raises:
-            ValueError: if another process trains in the same folder.
+            ValueError: if another process trains in the same folder, or has trained there since
+                `start`; if the simulation of a robot always fails.
         """
         config = self.config
         number, last = int(self.learner.iteration), self.last_iteration(max_steps)
         if number >= last:
             return
-        self.folder.mkdir(parents=True, exist_ok=True)
         if not self.in_step:
             if self.env.engine == "native":
                 self.env.restore(self.state, self.saved_physics)
@@ -708,7 +779,9 @@ class Trainer:
         self.in_step = False
         # On an accelerator there is nothing to overlap: the device does one thing at a time.
         overlap = self.env.engine == "native"
-        with alone_in(self.folder), ThreadPoolExecutor(1) as actor:
+        failures = Failures(self.env)
+        with self.alone(), ThreadPoolExecutor(1) as actor:
+            self._require_latest()
             curve = _Curve(self.folder / "training.csv", self.steps)
             state, trajectory = self._collect(self.behaviour, self.state, number)
             mark = time.monotonic()
@@ -731,6 +804,7 @@ class Trainer:
                 number += 1
                 now = time.monotonic()
                 self.seconds, elapsed, mark = self.seconds + now - mark, now - mark, now
+                failures.add(trajectory)
                 curve.add(trajectory, metrics, elapsed, config.batch)
                 if number % (curve_interval or CURVE_INTERVAL) == 0:
                     curve.write(self.steps, self.seconds)
@@ -751,7 +825,8 @@ class Trainer:
         Designs and episodes are those of the task: the policy-evaluation phase, from which the
         shipped banks come, has f ~ U([-r, r]^d) with r ~ U(0, 1) and short episodes.
 
-        Returns (Observation [M, ...] of numpy arrays, robot index int32[M]).
+        Returns (Observation [M, ...] of numpy arrays, robot index int32[M]); None if the
+        simulation fails in every step. Rollouts that fail so are left out.
         """
         count = self.config.state_bank
         env = self.env
@@ -771,13 +846,74 @@ class Trainer:
                 key = jax.random.fold_in(self.key, 1_000_003 + r * skip + s)
                 state, trajectory = env.rollout(self.act, self.learner.policy, state, key, length)
             good = np.argwhere(np.asarray(trajectory.finite))
+            if not len(good):
+                continue
             t, n = good[rng.choice(len(good), per, replace=per > len(good))].T
             parts.append(
                 jax.tree.map(lambda x, t=t, n=n: np.asarray(x)[t, n], trajectory.observation)
             )
             robots.append(owner[n])
+        if not parts:
+            return None
         bank = jax.tree.map(lambda *x: np.concatenate(x)[:count].astype(np.float32), *parts)
         return bank, np.concatenate(robots)[:count].astype(np.int32)
+
+
+class Failures:
+    """Watches rollouts for robots whose simulation always fails: nothing can be learned there."""
+
+    LEAST = 16
+    """Failed episodes without one that ends otherwise, at least; and one per environment."""
+
+    def __init__(self, env: Locomotion):
+        self.names = [robot.name for robot in env.robots]
+        counts = [group.count for group in env.groups]
+        self.owner = np.repeat(np.arange(len(counts)), counts)
+        self.limits = np.maximum(counts, self.LEAST)
+        self.failed = np.zeros(len(counts), int)
+
+    def add(self, trajectory: Trajectory) -> None:
+        """Count the episodes that ended in a rollout.
+
+        Raises:
+            ValueError: if all latest episodes of a robot ended with a simulation that is not
+                finite, as many as it has environments and at least LEAST.
+        """
+        finite = np.asarray(trajectory.finite)
+        ended = np.asarray(trajectory.terminated) | np.asarray(trajectory.truncated)
+
+        def per_robot(which):
+            return np.bincount(self.owner, which.sum(0), len(self.failed)).astype(int)
+
+        sound = per_robot(ended & finite) > 0
+        self.failed = np.where(sound, 0, self.failed + per_robot(~finite))
+        for name, failed, limit in zip(self.names, self.failed, self.limits, strict=True):
+            if failed >= limit:
+                raise ValueError(
+                    f"the simulation of robot {name!r} fails in every episode: its positions or "
+                    f"velocities became infinite in {failed} of the last {failed} episodes, so "
+                    "there is nothing to learn from; check the file (shapebody.validate_robot), "
+                    "above all gains, masses, inertias and armature, or give it a smaller timestep"
+                )
+
+
+def _check_state_bank(config: TrainConfig, sizes) -> None:
+    """ValueError before the training if its states could not be saved at the end."""
+    most = ARRAYS_LIMIT // (4 * (4 * sizes.joints + 3 * sizes.feet + 32))
+    if config.state_bank > most:
+        raise ValueError(
+            f"state_bank is {config.state_bank}; expected at most {most:,} for these robots, as "
+            "many as fit the file of an agent"
+        )
+
+
+def _version(folder: Path):
+    """What changes whenever the state in a folder is written; None where there is none."""
+    try:
+        status = (folder / "training.safetensors").stat()
+        return status.st_ino, status.st_mtime_ns, status.st_size
+    except FileNotFoundError:
+        return None
 
 
 def train(
@@ -828,18 +964,23 @@ def train(
             "many, or a configuration with fewer environments"
         )
     trainer = Trainer(config, folder, engine)
-    trainer.start()
-    begun = trainer.steps
-    if not (state_only or replace) and begun < trainer.last_iteration(max_steps) * config.batch:
-        others = ", state_only=True (--state-only) to leave it, or choose another name or folder"
-        _keep_agent(trainer.folder, begun, others)
-        _keep_critic(trainer.folder, others)
-    _run(trainer, progress, max_steps, max_seconds)
-    if state_only:
-        return None
-    if not replace and trainer.steps == begun <= (_agent_steps(trainer.folder) or 0):
-        return load_agent(trainer.folder)
-    return trainer.save_agent()
+    # From reading the state to saving the agent: what another call has written meanwhile would be
+    # lost.
+    with trainer.alone():
+        trainer.start()
+        begun = trainer.steps
+        if not (state_only or replace) and begun < trainer.last_iteration(max_steps) * config.batch:
+            others = (
+                ", state_only=True (--state-only) to leave it, or choose another name or folder"
+            )
+            _keep_agent(trainer.folder, begun, others)
+            _keep_critic(trainer.folder, others)
+        _run(trainer, progress, max_steps, max_seconds)
+        if state_only:
+            return None
+        if not replace and trainer.steps == begun <= (_agent_steps(trainer.folder) or 0):
+            return load_agent(trainer.folder)
+        return trainer.save_agent()
 
 
 STATE_FILES = ("training.safetensors", "training.json", "training.csv")
@@ -848,13 +989,9 @@ STATE_FILES = ("training.safetensors", "training.json", "training.csv")
 
 def _metadata(folder: Path) -> dict | None:
     """Metadata of the agent in a folder: None if there is no agent, {} if they are unreadable."""
-    path = folder / "agent.json"
-    if not path.exists():
-        return None
     try:
-        metadata = json.loads(path.read_text())["metadata"]
-        return metadata | {"steps": int(metadata["steps"])}
-    except (ValueError, LookupError, TypeError):
+        return read_metadata(folder)
+    except (ValueError, OSError):
         return {}
 
 
@@ -924,12 +1061,17 @@ def anneal(
     engine = _engine(folder, engine)
     config = _begin_annealing(folder, copy, steps, last_rate, replace)
     trainer = Trainer(config, copy, engine)
-    trainer.start()
-    _run(trainer, progress, None, max_seconds)
-    if trainer.steps < config.iterations * config.batch:
-        return None
-    agent = trainer.save_agent(folder)
-    shutil.rmtree(copy)
+    with trainer.alone():
+        trainer.start()
+        _run(trainer, progress, None, max_seconds)
+        if trainer.steps < config.iterations * config.batch:
+            return None
+        agent = trainer.save_agent(folder)
+        # By renaming it first: a copy of which a killed call has removed half would be no run.
+        finished = folder / f".annealed.{secrets.token_hex(4)}.tmp"
+        os.replace(copy, finished)
+    for leftover in folder.glob(".annealed.*.tmp"):
+        shutil.rmtree(leftover, ignore_errors=True)
     return agent
 
 
@@ -946,7 +1088,11 @@ def _begin_annealing(
     # The state is read first: curve rows that are newer than it do no harm.
     state = (folder / STATE_FILES[0]).read_bytes()
     done = _iterations(folder)
-    phases = json.loads((folder / "training.json").read_text())
+    phases = _phases(folder / "training.json")
+    # Checked, but kept as it was written: the copy continues from it.
+    _from_plain(
+        TrainConfig, phases[-1].get("config"), f"the configuration in {folder}/training.json"
+    )
     config = dict(phases[-1]["config"])
     batch = config["num_envs"] * config["rollout_length"]
     first, last = config["learning_rate"]
@@ -969,14 +1115,15 @@ def _begin_annealing(
         _keep_critic(folder)
     phases.append({"from_step": done * batch, "config": config})
     if (copy / "training.safetensors").exists():
-        if json.loads((copy / "training.json").read_text()) != phases:
+        delete = "delete that folder to begin anew"
+        if read_json(copy / "training.json", delete) != phases:
             raise ValueError(
                 f"{copy} is from an annealing that was stopped, of another step of the run or with "
                 "other steps or rate; delete that folder to begin anew"
             )
     else:
         atomic_write(copy / "training.json", json.dumps(phases, indent=1) + "\n")
-        atomic_write(copy / "training.csv", (folder / "training.csv").read_text())
+        atomic_write(copy / "training.csv", (folder / "training.csv").read_bytes())
         # The state comes last: a copy without it is made again.
         atomic_write(copy / "training.safetensors", state)
     return _from_plain(TrainConfig, config)
@@ -1024,14 +1171,23 @@ def train_critic(
         training, with those of this phase under "policy_evaluation". If the phase was stopped
         before its end, `agent` itself, and nothing in the folder is replaced.
     """
-    folder = Path(folder) if folder else data_dir() / "checkpoints" / agent.name
+    if folder is None:
+        folder = data_dir() / "checkpoints" / require_folder_name("the agent's name", agent.name)
+        # The agent may come from elsewhere, and its name be that of another one here.
+        if _metadata(folder) and load_agent(folder).policy_hash != agent.policy_hash:
+            raise ValueError(
+                f"the agent in {folder} has another policy than agent {agent.name!r}, whose new "
+                "critic would be saved there; give its own folder (folder=...)"
+            )
+    folder = Path(folder)
     missing = [name for name in ("config", "scale") if name not in agent.metadata]
     if missing:
         raise ValueError(
             f"the metadata of agent {agent.name!r} lack {missing[0]!r}, which says how its policy "
             "was trained; restore its agent.json, or train it anew"
         )
-    trained = _from_plain(TrainConfig, agent.metadata["config"])
+    what = f"metadata of agent {agent.name!r}: config"
+    trained = _from_plain(TrainConfig, agent.metadata["config"], what)
     base = TrainConfig.at_scale(agent.metadata["scale"], trained.robots[0], name=agent.name)
     length = max(base.rollout_length, 32)
     config = replace(
@@ -1059,14 +1215,17 @@ def train_critic(
     )
     # The state belongs to this policy: another one starts anew.
     trainer = Trainer(config, folder / f"critic_{agent.policy_hash[:8]}", engine, agent.policy)
-    trainer.start()
-    _run(trainer, progress, None, max_seconds)
-    if trainer.steps < config.iterations * config.batch:
-        return agent
-    sharper = trainer.agent(trainer.state_bank())
-    phase = {name: sharper.metadata[name] for name in ("config", "steps", "seconds")}
-    sharper = replace(sharper, metadata={**agent.metadata, "policy_evaluation": phase})
-    save_agent(sharper, folder)
+    phases = agent.metadata.get("phases") or [{}]
+    _require_same_robots(phases[0].get("robots", {}), trainer.env.robots, f"agent {agent.name!r}")
+    with trainer.alone():
+        trainer.start()
+        _run(trainer, progress, None, max_seconds)
+        if trainer.steps < config.iterations * config.batch:
+            return agent
+        sharper = trainer.agent(trainer.state_bank())
+        phase = {name: sharper.metadata[name] for name in ("config", "steps", "seconds")}
+        sharper = replace(sharper, metadata={**agent.metadata, "policy_evaluation": phase})
+        save_agent(sharper, folder)
     return sharper
 
 
@@ -1084,25 +1243,6 @@ def _run(trainer: Trainer, progress, max_steps, max_seconds) -> None:
             raise
         # The learner may be an iteration ahead of the state on disk, where the next call begins.
         trainer.start()
-
-
-def _plain(config: TrainConfig) -> dict:
-    """A configuration as it reads back from JSON: tuples are lists, inf is the text "Infinity"."""
-    return json.loads(json.dumps(asdict(config)), parse_constant=str)
-
-
-def _from_plain(kind, values: dict):
-    """The inverse of `_plain`: a configuration from what was read from JSON."""
-
-    def value(hint, given):
-        if is_dataclass(hint):
-            return _from_plain(hint, given)
-        if hint is float and given == "Infinity":
-            return math.inf
-        return tuple(value(None, x) for x in given) if isinstance(given, list) else given
-
-    hints = get_type_hints(kind)
-    return kind(**{name: value(hints.get(name), given) for name, given in values.items()})
 
 
 CHANGEABLE = (
@@ -1133,18 +1273,57 @@ def as_continued(config: TrainConfig, folder=None) -> TrainConfig:
     if not (folder / "training.safetensors").exists():
         return config
     try:
-        plain = json.loads((folder / "training.json").read_text())[-1]["config"]
-        last = _from_plain(TrainConfig, plain)
-    except (OSError, ValueError, LookupError, TypeError, AttributeError):
+        last = _from_plain(TrainConfig, _phases(folder / "training.json")[-1].get("config"))
+    except (OSError, ValueError):
         return config  # nothing to continue, or a damaged file, which `Trainer.start` reports
-    same = (last.name, last.robots, last.scale) == (config.name, config.robots, config.scale)
-    return last if same else config
+
+    def identity(config):
+        return config.name, [_robot_name(robot) for robot in config.robots], config.scale
+
+    # Their files may have moved; `Trainer.start` compares them with those of the run.
+    return replace(last, robots=config.robots) if identity(last) == identity(config) else config
+
+
+ANEW = "restore it, or delete training.safetensors beside it to begin anew"
+"""What to do about a damaged file of a run."""
 
 
 def _iterations(folder: Path) -> int:
     """Finished iterations of the run in a folder."""
-    state = read_safetensors(folder / "training.safetensors", "restore it, or train anew")
-    return int(state["learner/iteration"])
+    path = folder / "training.safetensors"
+    fix = "restore it, or delete it to begin anew"
+    number = read_number(path, "learner/iteration", fix)
+    if number < 0:
+        raise ValueError(f"{path} is damaged: it has {number} iterations; {fix}")
+    return number
+
+
+def _phases(path: Path) -> list[dict]:
+    """The phases of a run, as its training.json holds them (`_continued`).
+
+    Raises:
+        FileNotFoundError: if the file is missing.
+        ValueError: if it is damaged.
+    """
+    try:
+        phases = read_json(path, ANEW)
+        if not isinstance(phases, list) or not phases:
+            raise ValueError("it holds no phases")
+        kinds = {"config": dict, "from_step": int, "robots": dict, "engine": str}
+        for phase in phases:
+            if not isinstance(phase, dict):
+                raise ValueError("a phase is no object")
+            for name, kind in kinds.items():
+                if not isinstance(phase.get(name, kind()), kind):
+                    raise ValueError(f"{name} of a phase is of another kind than {kind.__name__}")
+            if phase.get("engine", "native") not in ("native", "mjx"):
+                raise ValueError(f"the engine is {shortened(phase['engine'])}")
+    except ValueError as error:
+        raise ValueError(
+            f"{path.name} is missing or damaged ({error}); it says how the run in {path.parent} "
+            f"was configured: {ANEW}"
+        ) from error
+    return phases
 
 
 def _engine(folder: Path, engine: str) -> str:
@@ -1157,8 +1336,8 @@ def _engine(folder: Path, engine: str) -> str:
         return engine
     try:
         # A run that does not say so is older than the record and native.
-        own = json.loads((folder / "training.json").read_text())[0].get("engine", "native")
-    except (OSError, ValueError, LookupError, TypeError, AttributeError):
+        own = _phases(folder / "training.json")[0].get("engine", "native")
+    except (OSError, ValueError):
         return engine  # a damaged file, which `Trainer.start` reports
     if engine not in ("auto", own):
         raise ValueError(
@@ -1177,23 +1356,23 @@ def _continued(path: Path, config: TrainConfig, steps: int, robots=()) -> list[d
         ValueError: if more than what is changeable, or a robot's file, differs from the run in
             `path`.
     """
-    try:
-        phases = json.loads(path.read_text())
-        before = dict(phases[-1]["config"])
-    except (OSError, ValueError, LookupError, TypeError) as error:
-        raise ValueError(
-            f"{path.name} is missing or damaged ({error}); it says how the run in "
-            f"{path.parent.name} was configured: restore it, or start anew in another folder"
-        ) from error
+    phases = _phases(path)
     try:
         # Settings that are newer than the run are at their defaults in it.
-        before = _plain(_from_plain(TrainConfig, before))
-    except TypeError as error:
+        last = _from_plain(TrainConfig, phases[-1].get("config"), "config")
+    except ValueError as error:
         raise ValueError(
-            f"{path.name} of the run in {path.parent.name} has settings that this version of "
-            f"shapebody does not know ({error}); continue it with the version that began it, or "
-            "start anew in another folder"
+            f"{path.name} of the run in {path.parent} is damaged, or has settings that this "
+            f"version of shapebody does not know ({error}); continue it with the version that "
+            f"began it, or {ANEW}"
         ) from error
+    before = _plain(replace(last, robots=tuple(_located(robot) for robot in last.robots)))
+    known = phases[0].get("robots", {})
+    if [r.name for r in robots] == [_robot_name(r) for r in last.robots] and all(
+        r.name in known for r in robots
+    ):
+        # Files that have only moved are the same robots: their hashes are compared below.
+        before["robots"] = list(config.robots)
     now = _plain(config)
     different = [name for name in now if before.get(name) != now[name]]
     changeable = list(CHANGEABLE)
@@ -1209,14 +1388,18 @@ def _continued(path: Path, config: TrainConfig, steps: int, robots=()) -> list[d
             "the old one, which shapebody.ppo.as_continued(config) returns, choose another name, "
             "or delete its training.safetensors to begin anew"
         )
-    known = phases[0].get("robots", {})
+    _require_same_robots(known, robots, f"the run in {path.parent.name}")
+    return phases + [{"from_step": steps, "config": now}] if different else phases
+
+
+def _require_same_robots(known: dict, robots, what: str) -> None:
+    """ValueError if the file of a robot is not the one whose hash was recorded."""
     changed = [r.name for r in robots if known.get(r.name, r.hash) != r.hash]
     if changed:
         raise ValueError(
-            f"the file of robot {', '.join(changed)} has changed since the run in "
-            f"{path.parent.name} began; put the old file back, or train under another name"
+            f"the file of robot {', '.join(changed)} has changed since {what} began, or is another "
+            "one of that name; put the old file back, or train under another name"
         )
-    return phases + [{"from_step": steps, "config": now}] if different else phases
 
 
 def _difference(name: str, old, new) -> str:
@@ -1226,25 +1409,61 @@ def _difference(name: str, old, new) -> str:
     return f"{name} was {old!r}, is {new!r}"
 
 
-def _rows(path: Path) -> list[dict[str, str]]:
-    """The rows of a learning curve as text, without those that a killed run left unfinished."""
+def _rows(path: Path) -> tuple[list[dict[str, str]], bool]:
+    """The rows of a learning curve as text, and whether others in the file are damaged.
+
+    A last row that a killed run left unfinished is left out and is no damage. No file, no rows.
+    """
+    if not path.exists():
+        return [], False
+    try:
+        text = read_text(path, ANEW)
+    except ValueError:
+        return [], True
     # The end of a line is written last; without it, even the last number may be cut off.
-    lines = [line for line in path.read_text().splitlines(keepends=True) if line.endswith("\n")]
+    header, *lines = [_cells(line) for line in text.split("\n")[:-1]] or [[]]
+    # A file of another version may have other columns; what is no header at all is damaged.
+    known = "steps" in header and set(header) <= set(CURVE)
+    names = header if known else CURVE
+    rows = [dict(zip(names, x, strict=True)) if _is_row(x, names) else None for x in lines]
+    whole = [row for row in rows if row is not None]
+    unfinished = bool(rows) and rows[-1] is None
+    return whole, bool(lines) and not known or len(rows) - len(whole) > unfinished
 
-    def whole(row):
-        # A missing cell is None, and cells that are too many are under the name None.
-        return None not in row and None not in row.values() and row["steps"].isdigit()
 
-    return [row for row in csv.DictReader(lines) if whole(row)]
+def _cells(line: str) -> list[str]:
+    """Cells of a line; numbers have no quotes."""
+    return line.removesuffix("\r").split(",")
+
+
+def _is_row(cells: list[str], names) -> bool:
+    """Whether these are the cells of a row: a number of steps, and numbers or nothing."""
+    if len(cells) != len(names):
+        return False
+    steps = cells[names.index("steps")]
+    try:
+        [float(cell) for cell in cells if cell]
+    except ValueError:
+        return False
+    return steps.isascii() and steps.isdigit() and len(steps) < 20
 
 
 class _Curve:
-    """Averages over iterations, appended to a CSV file. Rows after the resumed step go."""
+    """Averages over iterations, appended to a CSV file. Rows after the resumed step go.
+
+    A damaged file is kept beside it, and its undamaged rows are used.
+    """
 
     def __init__(self, path: Path, steps: int):
         self.path = path
-        rows = _rows(path) if path.exists() else []
+        rows, damaged = _rows(path)
+        if damaged:
+            kept = path.with_suffix(".damaged.csv")
+            os.replace(path, kept)
+            print(f"{path} was damaged: kept as {kept.name}, {len(rows)} rows could be read")
         rows = [row for row in rows if int(row["steps"]) <= steps]
+        # Of rows that are there twice, the first.
+        rows = list({int(row["steps"]): row for row in reversed(rows)}.values())[::-1]
         text = io.StringIO(newline="")
         writer = csv.DictWriter(text, CURVE)
         writer.writeheader()
@@ -1297,7 +1516,7 @@ class _Curve:
             for name, value in self._row().items()
             if name in CURVE and name != "seconds"
         }
-        with self.path.open("a", newline="") as file:
+        with names_path(self.path), self.path.open("a", newline="") as file:
             csv.DictWriter(file, CURVE).writerow(row)
         self._clear()
 

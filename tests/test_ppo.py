@@ -325,7 +325,9 @@ def test_a_run_continues_only_with_its_own_configuration(config, tmp_path):
     # A run that is older than a setting goes on with the setting's default.
     for phase in longer.phases:
         del phase["config"]["task"]["design_radius"]
-    longer.save()
+    with pytest.raises(ValueError, match="has changed since this trainer read it"):
+        longer.save()  # over the state of `brief`, which is newer
+    (tmp_path / "training.json").write_text(json.dumps(longer.phases))
     assert longer.start()
     longer.phases[0]["robots"]["unitree_go2"] = "another file"
     longer.save()
