@@ -18,14 +18,18 @@ import numpy as np
 import safetensors
 import safetensors.numpy
 
+from shapebody.checks import names_the_file, require_file, require_output, require_path
 
+
+@names_the_file
 def atomic_write(path: str | Path, data: bytes | str) -> Path:
     """Write a file so that it is never seen half-written; its folder is created if needed."""
-    path = Path(path)
+    path = require_output("path", path)
     atomic_write_all({path: data})
     return path
 
 
+@names_the_file
 def atomic_write_all(files: Mapping[Path, bytes | str]) -> None:
     """Write files that belong together; their folders are created if needed.
 
@@ -75,7 +79,7 @@ def alone_in(folder: str | Path):
     Raises:
         ValueError: if the folder is taken.
     """
-    handle = os.open(folder, os.O_RDONLY)
+    handle = os.open(require_path("folder", folder), os.O_RDONLY)
     try:
         try:
             fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
@@ -94,7 +98,7 @@ def read_curve(path: str | Path) -> dict[str, np.ndarray]:
 
     Raises ValueError if it holds no rows, or text where a number should be.
     """
-    with open(path, newline="", encoding="utf-8") as file:
+    with open(require_file("path", path), newline="", encoding="utf-8") as file:
         rows = list(csv.DictReader(file))
     if not rows:
         raise ValueError(f"{path} holds no rows; expected a header and one line per record")
@@ -140,7 +144,7 @@ def load_arrays(path: str | Path, like):
         ValueError: if the file is cut off, or its names, shapes or types differ from those of
             `like`.
     """
-    path = Path(path)
+    path = require_path("path", path)
     fix = "delete it to start anew, or use the configuration it was written with"
     stored = read_safetensors(path, fix)
     expected = dict(_leaves(like, shapes_only=True))
