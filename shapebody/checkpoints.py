@@ -35,7 +35,7 @@ import jax
 import numpy as np
 import safetensors.numpy
 
-from .checks import require_kind
+from .checks import require_kind, require_list, require_name, require_path, shown
 from .descriptions import Descriptions, Sizes
 from .files import (
     atomic_write,
@@ -56,6 +56,7 @@ from .networks import (
     Policy,
     PolicyConfig,
     initialize,
+    require_inputs,
 )
 from .paths import data_dir
 
@@ -118,10 +119,12 @@ class Agent:
 
     def act(self, descriptions: Descriptions, observation: Observation):
         """Action means [..., J], in units of the action scale."""
+        require_inputs(descriptions, observation)
         return _mean_action(self.policy_config)(self.policy, descriptions, observation)
 
     def values(self, descriptions: Descriptions, observation: Observation):
         """Values [..., K] of the critic's heads."""
+        require_inputs(descriptions, observation)
         return _values(self.critic_config)(self.critic, descriptions, observation)
 
     @functools.cached_property
@@ -213,9 +216,24 @@ def _commit() -> str | None:
 # ---------------------------------------------------------------------- agents
 
 
-def require_agent(agent) -> None:
-    """TypeError if it is no `Agent`, for example the name of one."""
-    require_kind("agent", agent, Agent, "load it with shapebody.load_agent(...)")
+def require_agent(agent) -> Agent:
+    """The argument; TypeError if it is no `Agent`, for example the name of one."""
+    return require_kind("agent", agent, Agent, "load it with shapebody.load_agent(...)")
+
+
+def chosen_folder(folder, name: str) -> Path:
+    """The folder that is given, or `data/checkpoints/<name>` if that is None."""
+    if folder is None:
+        return data_dir() / "checkpoints" / require_name("name", name)
+    return require_path("folder", folder)
+
+
+def _curve_rows(curve) -> list:
+    """The rows of a learning curve; ValueError if they are none."""
+    rows = require_list("curve", curve)
+    for number, row in enumerate(rows):
+        require_kind(f"row {number} of curve", row, Mapping, "a dictionary by column")
+    return rows
 
 
 def agents() -> list[str]:
@@ -242,7 +260,8 @@ def save_agent(
         ValueError: if shapes do not fit the configurations, or metadata cannot be written as JSON.
     """
     check_agent(agent)
-    folder = data_dir() / "checkpoints" / agent.name if folder is None else Path(folder)
+    folder = chosen_folder(folder, agent.name)
+    curve = None if curve is None else _curve_rows(curve)
     weights = _flat_weights(agent)
     states = _flat_states(agent)
     configuration = {
@@ -364,6 +383,8 @@ def load_curve(name_or_folder: str | Path) -> dict[str, np.ndarray]:
 
 def check_agent(agent: Agent) -> None:
     """Raise ValueError if the parts of an agent do not fit together."""
+    require_agent(agent)
+    require_name("the name of the agent", agent.name)
     if not agent.robots:
         raise ValueError(f"agent {agent.name!r} names no robots; give at least one")
     for role, module, variables in (
@@ -404,22 +425,22 @@ def check_agent(agent: Agent) -> None:
 
 def agent_folder(name_or_folder: str | Path) -> Path:
     """The folder of an agent that is given as in `load_agent`; raises what that raises."""
+    folder = require_path("agent", name_or_folder)
     text = str(name_or_folder)
     if isinstance(name_or_folder, Path) or os.sep in text or "/" in text:
-        folder = Path(name_or_folder).expanduser()
         if not folder.is_dir():
             raise FileNotFoundError(
-                f"agent folder {text!r} does not exist (looked at {folder.absolute()}): give an "
-                "existing folder, or one of the names of shapebody.checkpoints.agents()"
+                f"agent folder {shown(text)} does not exist (looked at {folder.absolute()}): give "
+                "an existing folder, or one of the names of shapebody.checkpoints.agents()"
             )
         return folder
     known = agents()
     if text not in known:
-        close = difflib.get_close_matches(text, known, n=1)
+        close = difflib.get_close_matches(text[:100], known, n=1)
         hint = f"; did you mean {close[0]!r}?" if close else "."
         listing = ", ".join(known) if known else "none"
         raise ValueError(
-            f"there is no agent {text!r} in {data_dir() / 'checkpoints'}{hint} "
+            f"there is no agent {shown(text)} in {data_dir() / 'checkpoints'}{hint} "
             f"Available agents: {listing}"
         )
     return data_dir() / "checkpoints" / text

@@ -1,5 +1,6 @@
 """Scales, agents to use at each, and experiments whose results are kept with their provenance."""
 
+import io
 import json
 import os
 import time
@@ -9,6 +10,21 @@ from pathlib import Path
 
 import numpy as np
 
+from shapebody.checks import (
+    require_array,
+    require_choice,
+    require_file,
+    require_flag,
+    require_function,
+    require_integer,
+    require_kind,
+    require_list,
+    require_name,
+    require_number,
+    require_output,
+    require_seed,
+    shown,
+)
 from shapebody.files import atomic_write
 from shapebody.paths import data_dir
 
@@ -50,9 +66,7 @@ BUDGETS = {
 def scale() -> str:
     """The scale in force: SHAPEBODY_SCALE, "smoke", "reduced" (the default) or "full"."""
     value = os.environ.get("SHAPEBODY_SCALE") or "reduced"
-    if value not in BUDGETS:
-        raise ValueError(f"SHAPEBODY_SCALE is {value!r}; expected one of {', '.join(BUDGETS)}")
-    return value
+    return require_choice("SHAPEBODY_SCALE", value, BUDGETS)
 
 
 def budget() -> Budget:
@@ -74,13 +88,14 @@ def study_setting() -> dict:
 def trained_robots(robots) -> list[str]:
     """Those of `robots` that have a shipped agent, in that order."""
     folder = data_dir() / "checkpoints"
+    robots = [require_name("a name in robots", name) for name in require_list("robots", robots)]
     return [name for name in robots if (folder / agent_name(name) / "agent.json").exists()]
 
 
 def agent_name(robot: str) -> str:
     """Name of the shipped agent for a robot at the scale in force: at `full`, the one trained with
     the paper's networks where there is one. `smoke` uses the reduced agent."""
-    full = f"{robot}_full"
+    full = f"{require_name('robot', robot)}_full"
     if scale() == "full" and (data_dir() / "checkpoints" / full / "agent.json").exists():
         return full
     return robot
@@ -92,6 +107,7 @@ def provenance(agent=None, seconds: float | None = None, **config) -> dict:
 
     record = {"config": config, "scale": scale(), **checkpoints.provenance()}
     if agent is not None:
+        checkpoints.require_agent(agent)
         record["agent"] = {
             "name": agent.name,
             "hash": agent.hash,
@@ -99,7 +115,7 @@ def provenance(agent=None, seconds: float | None = None, **config) -> dict:
             "steps": agent.metadata.get("steps"),
         }
     if seconds is not None:
-        record["seconds"] = round(seconds, 1)
+        record["seconds"] = round(require_number("seconds", seconds, 0), 1)
     return record
 
 
@@ -119,6 +135,7 @@ def result(name: str, compute: Callable[[], list[dict]], agent=None, recompute=F
     Returns:
         {"records": [...], "provenance": {...}}.
     """
+    require_function("compute", compute)
     return result_in_parts(name, {"all": compute}, agent, recompute, **config)
 
 
@@ -150,7 +167,13 @@ def result_in_parts(
         sum over these parts.
     """
     path, kept = result_path(name), scale() != "smoke"
-    settings = settings or {}
+    for label, value in (("recompute", recompute), ("progress", progress)):
+        require_flag(label, value)
+    for part, compute in _require_parts("parts", parts).items():
+        require_function(f"parts[{part!r}]", compute)
+    settings = {} if settings is None else _require_parts("settings", settings)
+    _require_agent(agent)
+    _require_json("config", config)
     known = _known_parts(path, agent, config, recompute) if kept else {}
     fitting = {part: known[part] for part in known if _fits(known[part], settings.get(part))}
     another = kept and path.exists() and (not known or len(fitting) < len(known))
@@ -179,7 +202,14 @@ def result_in_parts(
 
 def stored_result(path) -> dict:
     """What `result` returned when it wrote that file."""
-    return _joined(list(json.loads(path.read_text())["parts"].values()))
+    path = require_file("path", path)
+    try:
+        return _joined(list(json.loads(path.read_text(encoding="utf-8"))["parts"].values()))
+    except (ValueError, LookupError, TypeError, AttributeError) as error:
+        raise ValueError(
+            f"{path} is damaged or no stored result ({type(error).__name__}: {error}); delete it "
+            "and compute it anew"
+        ) from error
 
 
 def _joined(parts: list[dict]) -> dict:
@@ -202,10 +232,14 @@ def _set_aside(path) -> None:
 
 def stored_parts(name: str, agent=None, settings=None, **config) -> list[str]:
     """Names of the parts that `result_in_parts` would load for these arguments."""
+    path, settings = result_path(name), {} if settings is None else settings
+    _require_parts("settings", settings)
+    _require_agent(agent)
+    _require_json("config", config)
     if scale() == "smoke":
         return []
-    known = _known_parts(result_path(name), agent, config, overwrite=False)
-    return [part for part in known if _fits(known[part], (settings or {}).get(part))]
+    known = _known_parts(path, agent, config, overwrite=False)
+    return [part for part in known if _fits(known[part], settings.get(part))]
 
 
 def stored_config(name: str, agent=None) -> dict | None:
@@ -214,6 +248,7 @@ def stored_config(name: str, agent=None) -> dict | None:
     A damaged file has none: whoever wants its records is told.
     """
     path = result_path(name)
+    _require_agent(agent)
     if scale() == "smoke" or not path.exists():
         return None
     try:
@@ -227,7 +262,37 @@ def stored_config(name: str, agent=None) -> dict | None:
 def result_path(name: str) -> Path:
     """Where `result` keeps that experiment at the scale in force."""
     suffix = "" if scale() == "reduced" else f"_{scale()}"
+    require_name("name", name)
     return data_dir() / "results" / f"{name}{suffix}.json"
+
+
+def _require_agent(agent) -> None:
+    """TypeError if an agent that may be None is something else."""
+    if agent is not None:
+        from shapebody.checkpoints import require_agent
+
+        require_agent(agent)
+
+
+def _require_parts(name: str, parts) -> dict:
+    """The dictionary; TypeError if it is none, or if its keys are no texts."""
+    require_kind(name, parts, dict, "by name of the part")
+    for part in parts:
+        require_kind(f"a key of {name}", part, str, "the name of a part")
+    if name == "parts" and not parts:
+        raise ValueError("parts is {}; expected at least one part")
+    return parts
+
+
+def _require_json(name: str, value) -> None:
+    """ValueError if a value cannot be written as JSON."""
+    try:
+        json.dumps(value)
+    except (TypeError, ValueError) as error:
+        raise ValueError(
+            f"{name} is {shown(value)}, which JSON cannot hold ({error}); expected numbers, texts, "
+            "lists and dictionaries"
+        ) from error
 
 
 def _known_parts(path, agent, config, overwrite: bool) -> dict:
@@ -282,6 +347,8 @@ def _one_record_per_line(parts: dict) -> str:
 
 def verdict(low: float, high: float) -> str:
     """What an interval of a difference allows to say about its sign."""
+    if require_number("low", low) > require_number("high", high):
+        raise ValueError(f"low is {low} and high is {high}; expected low <= high")
     if low > 0:
         return "positive: the whole interval is above zero"
     if high < 0:
@@ -296,7 +363,9 @@ def rank_correlation(x, y, resamples: int = 2000, seed: int = 0) -> tuple[float,
     """
     from scipy.stats import rankdata
 
-    x, y = np.asarray(x, float), np.asarray(y, float)
+    x, y = require_array("x", x).astype(float), require_array("y", y).astype(float)
+    require_integer("resamples", resamples, 1, 1_000_000)
+    require_seed("seed", seed)
     if x.shape != y.shape or x.ndim != 1 or len(x) < 3:
         raise ValueError(f"x {x.shape} and y {y.shape}: expected two lists of three or more pairs")
 
@@ -352,6 +421,9 @@ def derived_constants(
     from shapebody.locomotion import TaskConfig
 
     space = DesignSpace(robot)
+    require_integer("starts", starts, 0, 100_000)
+    # A standard error needs two.
+    require_integer("episodes", episodes, 2, 1_000_000)
     designs = np.stack([space.reference] + [space.start(i) for i in range(starts)])
     kept, recomputed = (
         evaluate(
@@ -391,6 +463,7 @@ def before_after(agent, robot, path, start: int = 3, trust_region: float = 100.0
     from shapebody.design import DesignSpace
     from shapebody.search import search
 
+    path = require_output("path", path)
     space = DesignSpace(robot)
     f = space.start(start)
     found = search("vgds", agent, robot, f, trust_region=trust_region).design
@@ -401,4 +474,6 @@ def before_after(agent, robot, path, start: int = 3, trust_region: float = 100.0
     source.add_text(
         "provenance", json.dumps(provenance(agent, start=start, trust_region=trust_region))
     )
-    Image.fromarray(picture).save(path, pnginfo=source)
+    buffer = io.BytesIO()
+    Image.fromarray(picture).save(buffer, format="PNG", pnginfo=source)
+    atomic_write(path, buffer.getvalue())

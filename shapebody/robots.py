@@ -15,7 +15,8 @@ from pathlib import Path
 import mujoco
 import numpy as np
 
-from shapebody.checks import require_kind, require_path, shown
+from shapebody.checks import require_kind, require_path
+from shapebody.checks import shown as shortened
 from shapebody.feet import ends_without_foot, foot_ids, lowest, standing_height
 from shapebody.inference import complete
 from shapebody.paths import data_dir
@@ -33,7 +34,7 @@ _OBJ, _JOINT, _SENSOR = mujoco.mjtObj, mujoco.mjtJoint, mujoco.mjtSensor
 
 def require_robot(robot) -> "Robot":
     """The argument; TypeError if it is no Robot, such as a name."""
-    require_kind("robot", robot, Robot, f"load it with shapebody.load_robot({shown(robot)})")
+    require_kind("robot", robot, Robot, f"load it with shapebody.load_robot({shortened(robot)})")
     return robot
 
 
@@ -169,11 +170,11 @@ def find(name_or_path: str | Path) -> Path:
         if text in names:
             return data_dir() / "robots" / f"{text}.xml"
         if not os.path.exists(text):
-            close = difflib.get_close_matches(text, names, n=3, cutoff=0.5)
+            close = difflib.get_close_matches(text[:100], names, n=3, cutoff=0.5)
             hint = f" Did you mean {' or '.join(map(repr, close))}?" if close else ""
             raise ValueError(
-                f"unknown robot {shown(text)}.{hint} Available robots: {', '.join(names) or 'none'}. "
-                "For a file of your own give its path, e.g. 'my_robot.xml' or 'my_robot.urdf'"
+                f"unknown robot {shortened(text)}.{hint} "
+                f"Available robots: {', '.join(names) or 'none'}. For a file of your own give its path, e.g. 'my_robot.xml' or 'my_robot.urdf'"
             )
     if path.is_dir():
         files = sorted(f.name for f in path.iterdir() if f.suffix.lower() in SUFFIXES)
@@ -181,7 +182,7 @@ def find(name_or_path: str | Path) -> Path:
         raise ValueError(f"{path} is a folder: expected a file; give the path of {inside}")
     if not path.is_file():
         raise FileNotFoundError(
-            f"robot file {shown(text)} does not exist (looked at {path.absolute()}): "
+            f"robot file {shortened(text)} does not exist (looked at {path.absolute()}): "
             "give the path of an MJCF or URDF file, or one of the names of shapebody.robots()"
         )
     return path

@@ -12,7 +12,10 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from shapebody.checks import require_integer
+from shapebody.checks import refuse, require_integer, require_number
+
+MOST = 1_000_000
+"""Largest number of iterations, candidates and the like."""
 
 
 class Search(NamedTuple):
@@ -141,16 +144,17 @@ def require(config, expected: str, valid: Callable[[float], bool], *names: str) 
     """ValueError naming the first of the settings `names` of `config` that is not `valid`."""
     for name in names:
         value = getattr(config, name)
-        if not isinstance(value, numbers.Real) or not valid(value):
-            raise ValueError(f"{name} is {value!r}; expected {expected}")
+        if isinstance(value, bool) or not isinstance(value, numbers.Real) or not valid(value):
+            raise refuse(name, value, expected)
 
 
 def require_integers(config, *names: str, least: int = 1) -> None:
     """ValueError naming the first setting of `names` that is no integer of at least `least`."""
     for name in names:
-        require_integer(name, getattr(config, name), least)
+        require_integer(name, getattr(config, name), least, MOST)
 
 
 def require_positive(config, *names: str) -> None:
     """ValueError naming the first of the settings `names` that is not positive and finite."""
-    require(config, "a positive number", lambda x: 0 < x < float("inf"), *names)
+    for name in names:
+        require_number(name, getattr(config, name), above=0)
