@@ -302,6 +302,17 @@ def require_list(name: str, value, most: int | None = None) -> list:
     return values
 
 
+def require_records(name: str, value, columns: Iterable[str]) -> list[dict]:
+    """The value as a list; TypeError or ValueError if it holds no dictionaries with `columns`."""
+    records = require_list(name, value)
+    for record in records:
+        require_kind(f"an entry of {name}", record, dict, "a record of a study")
+        missing = [column for column in columns if column not in record]
+        if missing:
+            raise refuse(f"an entry of {name}", record, f"one with {', '.join(missing)}")
+    return records
+
+
 # ------------------------------------------------------------------ writing
 
 

@@ -33,12 +33,27 @@ import optax
 from shapebody.checkpoints import (
     Agent,
     atomic_write,
+    chosen_folder,
     load_agent,
     load_arrays,
+    require_agent,
     save_agent,
     save_arrays,
 )
-from shapebody.checks import require_integer, require_kind
+from shapebody.checks import (
+    refuse,
+    require_choice,
+    require_engine,
+    require_flag,
+    require_integer,
+    require_kind,
+    require_list,
+    require_name,
+    require_number,
+    require_path,
+    require_seed,
+    require_shape,
+)
 from shapebody.files import alone_in, read_safetensors
 from shapebody.locomotion import Locomotion, TaskConfig, Trajectory
 from shapebody.locomotion.observations import COMMAND, Observation
@@ -52,10 +67,11 @@ from shapebody.networks import (
     log_prob,
     standardization,
 )
-from shapebody.paths import data_dir
 from shapebody.robots import load_robot
 from shapebody.runtime import keep_memory
 
+MOST_STEPS = 10**15
+"""Largest number of environment steps."""
 SCALES = ("smoke", "reduced", "full")
 """Names of the sizes at which everything can be computed."""
 
@@ -110,7 +126,8 @@ class TrainConfig:
     """States kept for design search."""
 
     def __post_init__(self):
-        robots = (self.robots,) if isinstance(self.robots, str | Path) else tuple(self.robots)
+        single = isinstance(self.robots, str | Path)
+        robots = (self.robots,) if single else tuple(require_list("robots", self.robots, 1000))
         names = [_robot_name(robot) for robot in robots]
         robots = tuple(str(robot) for robot in robots)
         object.__setattr__(self, "robots", robots)
@@ -121,49 +138,38 @@ class TrainConfig:
                 f"robots is {robots!r}; expected robots of different names: a robot is known by "
                 "the name of its file, so leave out repeated ones, or copy a file to another name"
             )
-        if not self.name or Path(self.name).name != self.name:
-            raise ValueError(
-                f"name is {self.name!r}; expected the name of a folder, without separators"
-            )
+        require_name("name", self.name)
         counts = ("num_envs", "rollout_length", "total_steps", "minibatch_size", "epochs")
         for name in (*counts, "state_bank"):
             value = getattr(self, name)
-            object.__setattr__(self, name, require_integer(name, value, 1))
+            most = MOST_STEPS if name == "total_steps" else 2**24
+            object.__setattr__(self, name, require_integer(name, value, 1, most))
         for name in ("discount", "gae_lambda", "value_lambda"):
-            value = getattr(self, name)
-            if not _is_number(value, 1) and (name, value) != ("value_lambda", None):
-                raise ValueError(f"{name} is {value!r}; expected a number from 0 to 1")
-        object.__setattr__(self, "seed", require_integer("seed", self.seed))
+            if (name, self.value_lambda) != ("value_lambda", None):
+                require_number(name, getattr(self, name), 0, 1)
+        object.__setattr__(self, "seed", require_seed("seed", self.seed))
         for name, kind in (("policy", PolicyConfig), ("critic", CriticConfig)):
             hint = f"shapebody.{kind.__name__}.reduced(...)"
             require_kind(name, getattr(self, name), kind, hint)
         require_kind("task", self.task, TaskConfig, "shapebody.TaskConfig(...)")
         for name in ("standardize", "cut_at_commands", "learn_policy", "mean_actions"):
-            require_kind(name, getattr(self, name), bool, "True or False")
+            require_flag(name, getattr(self, name))
         if self.learn_policy and self.mean_actions:
             raise ValueError(
                 "mean_actions is True, but a policy learns from its exploration; expected "
                 "learn_policy=False with it"
             )
-        if self.scale not in SCALES:
-            raise ValueError(f"scale is {self.scale!r}; expected one of {', '.join(SCALES)}")
-        if not _is_number(self.entropy_coefficient, math.inf):
-            raise ValueError(
-                f"entropy_coefficient is {self.entropy_coefficient!r}; expected a number of at "
-                "least 0"
-            )
+        require_choice("scale", self.scale, SCALES)
+        require_number("entropy_coefficient", self.entropy_coefficient, 0)
         for name in ("clip_range", "max_gradient_norm", "kl_threshold"):
             value = getattr(self, name)
-            endless = name == "kl_threshold" and value == math.inf
-            if not endless and not (_is_number(value, math.inf) and value > 0):
-                raise ValueError(f"{name} is {value!r}; expected a positive number")
+            if not (name == "kl_threshold" and isinstance(value, float) and value == math.inf):
+                require_number(name, value, above=0)
         rates = self.learning_rate
-        rates = tuple(rates) if isinstance(rates, tuple | list) else ()
-        if len(rates) != 2 or not all(_is_number(rate, math.inf) for rate in rates):
-            raise ValueError(
-                f"learning_rate is {self.learning_rate!r}; expected two numbers of at least 0, "
-                "for the first and for the last step"
-            )
+        if not isinstance(rates, tuple | list) or len(rates) != 2:
+            expected = "two numbers of at least 0, for the first and for the last step"
+            raise refuse("learning_rate", rates, expected)
+        rates = tuple(require_number("a rate in learning_rate", rate, 0) for rate in rates)
         object.__setattr__(self, "learning_rate", rates)
         batch = self.num_envs * self.rollout_length
         if self.minibatch_size % self.rollout_length or self.minibatch_size > batch:
@@ -237,29 +243,21 @@ class TrainConfig:
     @classmethod
     def at_scale(cls, scale: str, robot: str, **changes) -> "TrainConfig":
         """`smoke`, `reduced` or `full` by name."""
-        if scale not in SCALES:
-            raise ValueError(f"scale is {scale!r}; expected one of {', '.join(SCALES)}")
+        require_choice("scale", scale, SCALES)
         return getattr(cls, scale)(robot, **changes)
 
 
 def _default_name(robot: str, changes: dict) -> str:
     """Name of an agent: its robots' names, or those of their files, joined with "+"."""
-    return "+".join(_robot_name(name) for name in changes.get("robots", (robot,)))
+    robots = changes.get("robots", (robot,))
+    robots = (robots,) if isinstance(robots, str | Path) else require_list("robots", robots)
+    return "+".join(_robot_name(name) for name in robots)
 
 
 def _robot_name(name_or_path) -> str:
     """The name of a robot that is given by name or file, without reading the file."""
-    if not isinstance(name_or_path, str | Path):
-        raise TypeError(
-            f"a robot is {name_or_path!r}; expected a name or the path of a file, as a text or Path"
-        )
-    return Path(name_or_path).stem
-
-
-def _is_number(value, high: float) -> bool:
-    """Whether a value is a finite number from 0 to `high`."""
-    number = isinstance(value, int | float) and not isinstance(value, bool)
-    return number and 0 <= value <= high and value < math.inf
+    path = require_path("robot", name_or_path)
+    return require_name("the name of the robot's file", path.stem)
 
 
 @jax.tree_util.register_dataclass
@@ -284,6 +282,11 @@ def advantages(reward, value, last_value, terminated, truncated, discount, gae_l
     one would have gone on: its last state's value stands for that of the next state, one control
     step later.
     """
+    for name, array in (("reward", reward), ("value", value), ("terminated", terminated)):
+        require_shape(name, array, ("N", "T"))
+    for name, array in (("value", value), ("terminated", terminated), ("truncated", truncated)):
+        require_shape(name, array, reward.shape)
+    require_shape("last_value", last_value, reward.shape[:1])
     done = terminated | truncated
     following = jnp.concatenate([value[:, 1:], last_value[:, None]], 1)
     following = jnp.where(truncated, value, following)
@@ -312,6 +315,8 @@ def command_changes(observation: Observation, last_observation: Observation):
 
 def make_policy_function(policy: Policy, mean_actions: bool = False):
     """The policy as `Locomotion.rollout` wants it; extra is the log density of the action."""
+    require_kind("policy", policy, Policy, "shapebody.Policy(...)")
+    require_flag("mean_actions", mean_actions)
 
     def act(variables, key, descriptions, observation):
         mean, std = policy.apply(variables, descriptions, observation)
@@ -342,6 +347,9 @@ def _apply(network, variables, descriptions, slot, observation):
 
 def make_update(config: TrainConfig, policy: Policy, critic: Critic):
     """The learner's iteration: (Learner, Trajectory, key) -> (Learner, metrics)."""
+    require_kind("config", config, TrainConfig, "such as TrainConfig.reduced(...)")
+    require_kind("policy", policy, Policy, "shapebody.Policy(...)")
+    require_kind("critic", critic, Critic, "shapebody.Critic(...)")
     optimizer = optax.chain(
         optax.clip_by_global_norm(config.max_gradient_norm), optax.scale_by_adam(eps=1e-5)
     )
@@ -549,9 +557,10 @@ class Trainer:
     """
 
     def __init__(self, config: TrainConfig, folder=None, engine: str = "auto", policy=None):
+        _require_run(config, engine)
         keep_memory()
         self.config = config
-        self.folder = Path(folder) if folder else data_dir() / "checkpoints" / config.name
+        self.folder = chosen_folder(folder, config.name)
         robots = [load_robot(name) for name in config.robots]
         task = config.task
         if not config.learn_policy:
@@ -666,7 +675,7 @@ class Trainer:
 
         folder: where to; the run's own if not given.
         """
-        folder = Path(folder) if folder else self.folder
+        folder = self.folder if folder is None else require_path("folder", folder)
         agent = self.agent(self.state_bank())
         curve = self.folder / "training.csv"
         save_agent(agent, folder, _rows(curve) if curve.exists() else None)
@@ -680,6 +689,8 @@ class Trainer:
 
     def last_iteration(self, max_steps=None) -> int:
         """Number of finished iterations at which `run` ends with that budget."""
+        if max_steps is not None:
+            require_integer("max_steps", max_steps, 0, MOST_STEPS)
         last = self.config.iterations
         return last if max_steps is None else min(last, max_steps // self.config.batch)
 
@@ -695,6 +706,9 @@ class Trainer:
         Raises:
             ValueError: if another process trains in the same folder.
         """
+        _require_budget(max_steps, max_seconds, progress)
+        if curve_interval is not None:
+            require_integer("curve_interval", curve_interval, 1)
         config = self.config
         number, last = int(self.learner.iteration), self.last_iteration(max_steps)
         if number >= last:
@@ -753,6 +767,7 @@ class Trainer:
 
         Returns (Observation [M, ...] of numpy arrays, robot index int32[M]).
         """
+        require_integer("rollouts", rollouts, 1, 100_000)
         count = self.config.state_bank
         env = self.env
         if not env.config.fixed_coefficient:
@@ -818,7 +833,10 @@ def train(
             steps than the run that is to go on, or if the run there cannot be continued with
             `config`.
     """
-    require_kind("config", config, TrainConfig, 'for example TrainConfig.reduced("unitree_go2")')
+    _require_run(config, engine)
+    _require_budget(max_steps, max_seconds, progress)
+    for name, value in (("state_only", state_only), ("replace", replace)):
+        require_flag(name, value)
     given = {"robots": config.robots, "name": config.name}
     if config == TrainConfig.at_scale(config.scale, config.robots[0], **given):
         config = as_continued(config, folder)
@@ -844,6 +862,20 @@ def train(
 
 STATE_FILES = ("training.safetensors", "training.json", "training.csv")
 """A run in its folder: its state, its configurations and its learning curve."""
+
+
+def _require_run(config, engine: str = "auto") -> None:
+    hint = 'for example TrainConfig.reduced("unitree_go2")'
+    require_kind("config", config, TrainConfig, hint)
+    require_engine("engine", engine)
+
+
+def _require_budget(max_steps, max_seconds, progress) -> None:
+    if max_steps is not None:
+        require_integer("max_steps", max_steps, 0, MOST_STEPS)
+    if max_seconds is not None:
+        require_number("max_seconds", max_seconds, 0)
+    require_flag("progress", progress)
 
 
 def _metadata(folder: Path) -> dict | None:
@@ -919,7 +951,12 @@ def anneal(
             the agent in the folder has more steps or a critic from policy evaluation, or the copy
             that was stopped is of another step of the run or has other settings.
     """
-    folder = Path(folder) if folder else data_dir() / "checkpoints" / name
+    require_integer("steps", steps, 1, MOST_STEPS)
+    require_number("last_rate", last_rate, 0)
+    require_engine("engine", engine)
+    _require_budget(None, max_seconds, progress)
+    require_flag("replace", replace)
+    folder = chosen_folder(folder, name)
     copy = folder / "annealed"
     engine = _engine(folder, engine)
     config = _begin_annealing(folder, copy, steps, last_rate, replace)
@@ -957,7 +994,7 @@ def _begin_annealing(
             f"last_rate is {last_rate:g}, above the present rate of the run, {rate:g}: give a "
             "lower one"
         )
-    more = max(1, round(require_integer("steps", steps, 1) / batch))
+    more = max(1, round(steps / batch))
     # Linear over the whole run, through the present rate now and the last one at the end.
     slope = (last_rate - rate) / more
     config |= {
@@ -1024,7 +1061,13 @@ def train_critic(
         training, with those of this phase under "policy_evaluation". If the phase was stopped
         before its end, `agent` itself, and nothing in the folder is replaced.
     """
-    folder = Path(folder) if folder else data_dir() / "checkpoints" / agent.name
+    require_agent(agent)
+    require_kind("critic", critic, CriticConfig, "shapebody.CriticConfig.sharp()")
+    if steps is not None:
+        require_integer("steps", steps, 1, MOST_STEPS)
+    require_engine("engine", engine)
+    _require_budget(None, max_seconds, progress)
+    folder = chosen_folder(folder, agent.name)
     missing = [name for name in ("config", "scale") if name not in agent.metadata]
     if missing:
         raise ValueError(
@@ -1129,7 +1172,8 @@ def as_continued(config: TrainConfig, folder=None) -> TrainConfig:
     with the settings that it was begun with, whatever the defaults are now. To change one that may
     change (`CHANGEABLE`, `CHANGEABLE_INSIDE`), replace it in the result.
     """
-    folder = Path(folder) if folder else data_dir() / "checkpoints" / config.name
+    _require_run(config)
+    folder = chosen_folder(folder, config.name)
     if not (folder / "training.safetensors").exists():
         return config
     try:

@@ -174,7 +174,8 @@ def find(name_or_path: str | Path) -> Path:
             hint = f" Did you mean {' or '.join(map(repr, close))}?" if close else ""
             raise ValueError(
                 f"unknown robot {shortened(text)}.{hint} "
-                f"Available robots: {', '.join(names) or 'none'}. For a file of your own give its path, e.g. 'my_robot.xml' or 'my_robot.urdf'"
+                f"Available robots: {', '.join(names) or 'none'}. "
+                "For a file of your own give its path, e.g. 'my_robot.xml' or 'my_robot.urdf'"
             )
     if path.is_dir():
         files = sorted(f.name for f in path.iterdir() if f.suffix.lower() in SUFFIXES)

@@ -19,6 +19,7 @@ from shapebody.checks import (
     require_kind,
     require_list,
     require_number,
+    require_records,
     require_seed,
     require_text,
     shown,
@@ -320,7 +321,7 @@ def gains(records: list[dict], quantity: str = "return") -> list[dict]:
         ValueError: if a design has no counterpart to be compared with, or the records come from
             two engines.
     """
-    records = _records("records", records, ("origin", "method", "trust_region", "start"))
+    records = require_records("records", records, ("origin", "method", "trust_region", "start"))
     require_text("quantity", quantity)
     # Returns are stored by episode, other quantities as means.
     detail = "returns" if quantity == "return" else quantity
@@ -379,17 +380,6 @@ def gains(records: list[dict], quantity: str = "return") -> list[dict]:
     return rows
 
 
-def _records(name: str, records, columns) -> list[dict]:
-    """The records; TypeError or ValueError if they are no dictionaries with these columns."""
-    records = require_list(name, records)
-    for record in records:
-        require_kind(f"an entry of {name}", record, dict, "a record of a study")
-        missing = [column for column in columns if column not in record]
-        if missing:
-            raise ValueError(f"an entry of {name} is {shown(record)}; expected one with {missing}")
-    return records
-
-
 def gain(rows: list[dict], method: str, over: str, trust_region: float | None = None) -> dict:
     """The one row of `gains` with that method, comparison and λ; ValueError if there is none."""
     require_text("method", method)
@@ -397,7 +387,7 @@ def gain(rows: list[dict], method: str, over: str, trust_region: float | None = 
     if trust_region is not None:
         require_number("trust_region", trust_region, 0)
     wanted = {"method": method, "over": over, "trust_region": trust_region}
-    rows = _records("rows", rows, wanted)
+    rows = require_records("rows", rows, wanted)
     for row in rows:
         if all(row[name] == value for name, value in wanted.items()):
             return row
