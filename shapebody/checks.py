@@ -228,7 +228,7 @@ def require_text(name: str, value, longest: int = 1000) -> str:
 def require_name(name: str, value) -> str:
     """The value; ValueError if a file or folder cannot have that name on every system."""
     right = isinstance(value, str) and value.strip() not in ("", ".", "..")
-    right = right and not any(c in '/\\:*?"<>|' or ord(c) < 32 or c == "\x7f" for c in value)
+    right = right and value.isprintable() and not set(value) & set('/\\:*?"<>|')
     # 55 bytes are left for what is added: suffixes, and those of temporary files.
     if not right or len(value.encode(errors="replace")) > LONGEST_PART - 55:
         raise refuse(
@@ -248,7 +248,10 @@ def require_path(name: str, value) -> Path:
     text = os.fspath(value)
     if not isinstance(text, str) or not text.strip() or "\x00" in text:
         raise refuse(name, text, f"{expected}, not empty and without NUL characters")
-    parts = [part.encode(errors="surrogatepass") for part in Path(text).parts]
+    try:
+        parts = [os.fsencode(part) for part in Path(text).parts]
+    except UnicodeEncodeError as error:
+        raise refuse(name, text, f"{expected}, of characters that file names can have") from error
     if len(os.fsencode(text)) > LONGEST_PATH or max(map(len, parts), default=0) > LONGEST_PART:
         raise refuse(
             name,

@@ -138,11 +138,17 @@ def _code(notebook):
     return [cell for cell in notebook.cells if cell.cell_type == "code"]
 
 
-def main(arguments=None) -> int:
+def parser() -> argparse.ArgumentParser:
+    """The options of the command."""
     parser = argparse.ArgumentParser(prog="python -m shapebody.notebooks", description=__doc__)
     parser.add_argument("notebook", nargs="*", type=Path)
     parser.add_argument("--check", action="store_true", help="only check, execute nothing")
-    options = parser.parse_args(arguments)
+    return parser
+
+
+def main(arguments=None) -> int:
+    """Execute and check notebooks; returns the exit status."""
+    options = parser().parse_args(arguments)
     failed = 0
     for path in options.notebook:
         if not options.check:
