@@ -52,11 +52,13 @@ def refuse(name: str, value, expected: str, hint: str = "", kind: type = ValueEr
     return kind(f"{name} is {shown(value)}; expected {expected}{f': {hint}' if hint else ''}")
 
 
-def require_kind(name: str, value, kind: type, hint: str):
-    """The value; TypeError if it is no instance of `kind`. `hint` says how to come by one."""
+def require_kind(name: str, value, kind, hint: str):
+    """The value; TypeError if it is no instance of `kind`, a class or classes joined with "|".
+    `hint` says how to come by one."""
     if not isinstance(value, kind):
-        article = "an" if kind.__name__[0] in "AEIOU" else "a"
-        raise refuse(name, value, f"{article} {kind.__name__}", hint, TypeError)
+        label = getattr(kind, "__name__", str(kind))
+        article = "an" if label[0] in "AEIOU" else "a"
+        raise refuse(name, value, f"{article} {label}", hint, TypeError)
     return value
 
 
@@ -228,14 +230,14 @@ def require_text(name: str, value, longest: int = 1000) -> str:
 def require_name(name: str, value) -> str:
     """The value; ValueError if a file or folder cannot have that name on every system."""
     right = isinstance(value, str) and value.strip() not in ("", ".", "..")
-    right = right and value.isprintable() and not set(value) & set('/\\:*?"<>|')
+    right = right and value.isprintable() and not set(value) & set("/\\")
     # 55 bytes are left for what is added: suffixes, and those of temporary files.
     if not right or len(value.encode(errors="replace")) > LONGEST_PART - 55:
         raise refuse(
             name,
             value,
             f"the name of a file or folder: at most {LONGEST_PART - 55} characters, without "
-            "separators and other special ones",
+            "separators",
         )
     return value
 
@@ -276,6 +278,14 @@ def require_output(name: str, value) -> Path:
     return path
 
 
+def require_folder(name: str, value) -> Path:
+    """The value as the Path of a folder; FileNotFoundError if there is none."""
+    path = require_path(name, value)
+    if not path.is_dir():
+        raise FileNotFoundError(f"{name} is {shown(str(value))}, where there is no folder")
+    return path
+
+
 def require_file(name: str, value) -> Path:
     """The value as the Path of a file; FileNotFoundError if there is none."""
     path = require_path(name, value)
@@ -292,8 +302,9 @@ def require_function(name: str, value) -> Callable:
 
 
 def require_list(name: str, value, most: int | None = None) -> list:
-    """The values as a list; ValueError for a text, a dictionary, a number or too many of them."""
-    right = isinstance(value, Iterable) and not isinstance(value, str | bytes | Mapping)
+    """The values as a list; ValueError for what is no sequence, such as a text, or for too many."""
+    unordered = str | bytes | Mapping | set | frozenset
+    right = isinstance(value, Iterable) and not isinstance(value, unordered)
     try:
         values = list(value) if right else None
     except TypeError:  # an array without axes
@@ -324,10 +335,11 @@ def names_the_file(function: Callable) -> Callable:
     error says where, and of a full disk that it is full."""
 
     @functools.wraps(function)
-    def named(target, *arguments, **options):
+    def named(*arguments, **options):
         try:
-            return function(target, *arguments, **options)
+            return function(*arguments, **options)
         except OSError as error:
+            target = (*arguments, *options.values())[0]
             paths = list(target) if isinstance(target, Mapping) else [target]
             if getattr(error, "told", False) or not paths:
                 raise

@@ -140,7 +140,8 @@ def critic_correlations(critics: dict, robot, records: list[dict]) -> dict[str, 
     """
     _require_critics(critics)
     space = DesignSpace(robot)
-    require_records("records", records, ("design", "return"))
+    if len(require_records("records", records, ("design", "return"))) < 3:
+        raise ValueError(f"records has {len(records)} entries; expected three or more")
     designs = np.stack([space.start(record["design"]) for record in records])
     returns = [record["return"] for record in records]
     return {

@@ -14,6 +14,7 @@ import numpy as np
 
 from shapebody.checkpoints import Agent, require_agent
 from shapebody.checks import (
+    refuse,
     require_array,
     require_engine,
     require_flag,
@@ -458,11 +459,10 @@ def paired_gain(
                     f"{before.settings[name]!r}; repeat one with the settings of the other"
                 )
     _require_resampling(confidence, resamples, seed)
-    after, before = (
-        require_array(name, x.returns if isinstance(x, Evaluation) else x)
-        for name, x in (("after", after), ("before", before))
-    )
-    differences = _differences(after, before)
+    after, before = (x.returns if isinstance(x, Evaluation) else x for x in (after, before))
+    if before is None:
+        raise refuse("before", before, "an evaluation or an array of numbers")
+    differences = _differences(after, before, ("after", "before"))
     if differences.ndim > 2:
         raise ValueError(f"returns have shape {differences.shape}; expected [E] or [S, E]")
     if differences.ndim == 1:
@@ -478,21 +478,18 @@ def paired_gain(
     return Gain(float(differences.mean()), low, high, differences)
 
 
-def _differences(values, baseline):
-    values = require_array("values", values, finite=False).astype(np.float64)
-    if values.ndim == 0 or values.shape[-1] == 0:
-        raise ValueError(f"values have shape {values.shape}; expected [..., n] with n >= 1")
-    if baseline is not None:
-        baseline = require_array("baseline", baseline, finite=False).astype(np.float64)
-        if baseline.shape != values.shape:
-            raise ValueError(
-                f"values {values.shape} and baseline {baseline.shape} have different shapes; "
-                "paired numbers need the same"
-            )
-        values = values - baseline
-    if not np.isfinite(values).all():
-        raise ValueError("values contain numbers that are not finite; remove or replace them")
-    return values
+def _differences(values, baseline, names=("values", "baseline")):
+    """values - baseline, float64 [..., n]; ValueError naming the argument that is wrong."""
+    values = require_array(names[0], values, ("...", "n")).astype(np.float64)
+    if baseline is None:
+        return values
+    baseline = require_array(names[1], baseline).astype(np.float64)
+    if baseline.shape != values.shape:
+        raise ValueError(
+            f"{names[0]} {values.shape} and {names[1]} {baseline.shape} have different shapes; "
+            "paired numbers need the same"
+        )
+    return values - baseline
 
 
 def _out(value):

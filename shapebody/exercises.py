@@ -516,11 +516,12 @@ def check_per_motor(answer) -> None:
         print(f"Not yet. The answer is {_shown(answer)}; it should be the name of one robot.")
         return
     from shapebody.catalog import robot_table
+    from shapebody.robots import robots
 
-    ratios = {row["name"]: row["design_dim"] / row["actuators"] for row in robot_table()}
-    if answer not in ratios:
-        print(f"Not yet. There is no robot {answer!r}; use a name of sb.robots().")
+    if answer not in robots():
+        print(f"Not yet. There is no robot {_shown(answer)}; use a name of sb.robots().")
         return
+    ratios = {row["name"]: row["design_dim"] / row["actuators"] for row in robot_table()}
     best = max(ratios, key=ratios.get)
     _say(
         answer == best,

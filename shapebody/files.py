@@ -18,13 +18,21 @@ import numpy as np
 import safetensors
 import safetensors.numpy
 
-from shapebody.checks import names_the_file, require_file, require_output, require_path
+from shapebody.checks import (
+    names_the_file,
+    require_file,
+    require_folder,
+    require_kind,
+    require_output,
+    require_path,
+)
 
 
 @names_the_file
 def atomic_write(path: str | Path, data: bytes | str) -> Path:
     """Write a file so that it is never seen half-written; its folder is created if needed."""
     path = require_output("path", path)
+    require_kind("data", data, bytes | str, "a text or bytes")
     atomic_write_all({path: data})
     return path
 
@@ -36,6 +44,8 @@ def atomic_write_all(files: Mapping[Path, bytes | str]) -> None:
     All are written under temporary names first. Then they take their places at once, in the given
     order. An interruption before that leaves all the old files; Ctrl-C during it waits.
     """
+    require_kind("files", files, Mapping, "what to write, by path")
+    files = {require_path("a path in files", path): data for path, data in files.items()}
     temporaries = {}
     try:
         for path, data in files.items():
@@ -79,7 +89,7 @@ def alone_in(folder: str | Path):
     Raises:
         ValueError: if the folder is taken.
     """
-    handle = os.open(require_path("folder", folder), os.O_RDONLY)
+    handle = os.open(require_folder("folder", folder), os.O_RDONLY)
     try:
         try:
             fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
@@ -113,6 +123,7 @@ def read_curve(path: str | Path) -> dict[str, np.ndarray]:
 
 def read_safetensors(path: Path, fix: str) -> dict[str, np.ndarray]:
     """Arrays of a safetensors file by name; errors end with `fix`."""
+    path = require_path("path", path)
     if not path.is_file():
         raise FileNotFoundError(f"{path} does not exist; {fix}")
     try:

@@ -13,11 +13,8 @@ def data_dir() -> Path:
     Raises FileNotFoundError if that folder does not exist.
     """
     override = os.environ.get("SHAPEBODY_DATA")
-    folder = (
-        require_path("SHAPEBODY_DATA", override)
-        if override
-        else Path(__file__).resolve().parent.parent / "data"
-    )
+    shipped = Path(__file__).resolve().parent.parent / "data"
+    folder = require_path("SHAPEBODY_DATA", override) if override else shipped
     if not folder.is_dir():
         raise FileNotFoundError(
             f"data folder {str(folder)!r} does not exist: set SHAPEBODY_DATA to the 'data' folder "

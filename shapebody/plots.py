@@ -130,7 +130,8 @@ class Table:
     caption: str = ""
 
     def __post_init__(self):
-        for name, row in (("header", self.header), *(("a row", row) for row in self.rows)):
+        rows = require_list("rows", self.rows)
+        for name, row in (("header", self.header), *(("a row", row) for row in rows)):
             require_kind(name, row, tuple, "of texts, see plots.table")
             for cell in row:
                 require_text(f"a cell of {name}", cell, 10_000)

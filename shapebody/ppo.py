@@ -20,6 +20,7 @@ import math
 import shutil
 import sys
 import time
+from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass, field, is_dataclass, replace
 from pathlib import Path
@@ -145,7 +146,7 @@ class TrainConfig:
             most = MOST_STEPS if name == "total_steps" else 2**24
             object.__setattr__(self, name, require_integer(name, value, 1, most))
         for name in ("discount", "gae_lambda", "value_lambda"):
-            if (name, self.value_lambda) != ("value_lambda", None):
+            if name != "value_lambda" or self.value_lambda is not None:
                 require_number(name, getattr(self, name), 0, 1)
         object.__setattr__(self, "seed", require_seed("seed", self.seed))
         for name, kind in (("policy", PolicyConfig), ("critic", CriticConfig)):
@@ -558,6 +559,8 @@ class Trainer:
 
     def __init__(self, config: TrainConfig, folder=None, engine: str = "auto", policy=None):
         _require_run(config, engine)
+        if policy is not None and not (isinstance(policy, Mapping) and "params" in policy):
+            raise refuse("policy", policy, "variables of a Policy, such as agent.policy")
         keep_memory()
         self.config = config
         self.folder = chosen_folder(folder, config.name)

@@ -6,6 +6,7 @@ share one batch: joints, feet and spheres are padded to the largest robot and ma
 """
 
 import copy
+import inspect
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
@@ -16,6 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from shapebody.checks import (
+    refuse,
     require_array,
     require_engine,
     require_flag,
@@ -220,11 +222,13 @@ class Locomotion:
         if engine == "native":
             from shapebody.physics.native import NativePhysics
 
+            _require_options(options, NativePhysics)
             for group in self.groups:
                 group.physics = NativePhysics(group.robot, group.count, threads=threads, **options)
         else:
             from shapebody.physics.mjx import MjxPhysics
 
+            _require_options(options, MjxPhysics)
             for group in self.groups:
                 group.physics = MjxPhysics(group.robot, group.count, **options)
         self._account = jax.jit(self._moving_part)
@@ -436,18 +440,24 @@ class Locomotion:
             ValueError: for designs of another shape, outside [-1, 1] or not finite.
         """
         require_kind("state", state, Episode, "what reset, step or rollout returned")
-        rows = require_array("rows", rows, (np.size(rows),), kinds="iu")
+        rows = require_array("rows", rows, kinds="iu")
+        if rows.ndim != 1:
+            raise refuse("rows", rows, "a list of numbers of environments")
         if rows.size and (rows.min() < 0 or rows.max() >= self.num_envs):
             raise ValueError(
                 f"rows reach from {rows.min()} to {rows.max()}; expected numbers of environments, "
                 f"0 to {self.num_envs - 1}"
             )
         keys = np.asarray(require_key("keys", keys, rows.shape))
-        for name, value in (("coefficient", coefficient), ("streak", streak)):
-            shape = () if np.ndim(value) == 0 else rows.shape
-            require_array(name, value, shape, kinds="iu" if name == "streak" else "fiu")
-        if np.size(coefficient) and not 0 <= np.min(coefficient) <= np.max(coefficient) <= 1:
-            raise ValueError(f"coefficient is {coefficient}; expected numbers from 0 to 1")
+        for name, value, kinds, low, high in (
+            ("coefficient", coefficient, "fiu", 0, 1),
+            ("streak", streak, "iu", -(2**31), 2**31 - 1),
+        ):
+            values = require_array(name, value, kinds=kinds)
+            right = values.shape in ((), rows.shape) and np.all((values >= low) & (values <= high))
+            if not right:
+                expected = f"one number from {low} to {high}, or one for each of rows"
+                raise refuse(name, value, expected)
         if designs is not None:
             designs = self._validated(designs, len(rows), rows)
         coefficient = np.broadcast_to(np.asarray(coefficient, np.float32), rows.shape)
@@ -650,6 +660,15 @@ class Locomotion:
             _, embodiments = self._bodies(group, designs[group.slice, : group.space.dim])
             group.physics.set_designs(np.arange(group.count), embodiments)
             group.physics.restore(saved)
+
+
+def _require_options(options: dict, engine) -> None:
+    """ValueError if an engine's constructor does not take these."""
+    given = ("robot", "num_envs", "threads")
+    known = [name for name in inspect.signature(engine).parameters if name not in given]
+    for name in options:
+        if name not in known:
+            raise refuse("a key of physics_options", name, f"one of {', '.join(known)}")
 
 
 def _record(state: Episode, observation, action, extra, outcome: Outcome) -> StepRecord:

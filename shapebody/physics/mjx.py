@@ -155,7 +155,8 @@ class MjxPhysics:
         The values given for the other simulations are computed with but not used.
         """
         _require_state(state)
-        require_shape("mask", mask, None)
+        if not isinstance(mask, jax.Array):
+            mask = require_array("mask", mask, kinds="b")
         mask = jnp.asarray(mask)
         if mask.shape != (self.num_envs,) or mask.dtype != bool:
             raise ValueError(

@@ -12,7 +12,14 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from shapebody.checks import refuse, require_integer, require_number
+from shapebody.checks import (
+    refuse,
+    require_array,
+    require_integer,
+    require_key,
+    require_kind,
+    require_number,
+)
 
 MOST = 1_000_000
 """Largest number of iterations, candidates and the like."""
@@ -58,6 +65,10 @@ def iterate(objective, starts, key, config, steps: Steps, evaluations: int) -> S
     its result does not depend on the other starts, to the last bit: each is searched by the same
     program, on a CPU as many at a time as there are cores.
     """
+    starts = require_array("starts", starts, ("S", "d"))
+    require_key("key", key)
+    require_kind("steps", steps, Steps, "three functions of the method, see there")
+    require_integer("evaluations", evaluations)
     starts = jnp.asarray(starts)
     # Compiled here, once; threads that meet an uncompiled function would each compile it.
     run = _run.lower(objective, starts[0], key, config, steps).compile()
