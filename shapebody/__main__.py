@@ -11,7 +11,8 @@ _FLAG = "--xla_cpu_multi_thread_eigen=false"
 _REPLACE = "replace the saved agent even if it has more steps, or a critic made by sharpen"
 
 
-def main(arguments=None) -> int:
+def parser() -> argparse.ArgumentParser:
+    """The commands and their options."""
     parser = argparse.ArgumentParser(prog="python -m shapebody", description=__doc__)
     commands = parser.add_subparsers(dest="command", required=True)
 
@@ -72,15 +73,20 @@ def main(arguments=None) -> int:
     for command in (train, anneal, sharpen, evaluate):
         command.add_argument("--engine", choices=("auto", "native", "mjx"), default="auto")
 
-    options = parser.parse_args(arguments)
-    if options.command == "validate":
-        return _validate(options)
+    return parser
+
+
+def main(arguments=None) -> int:
+    """Run a command; returns its exit status. Errors are one line on stderr."""
+    options = parser().parse_args(arguments)
     if options.command in ("train", "anneal", "sharpen"):
         os.environ["XLA_FLAGS"] = f"{os.environ.get('XLA_FLAGS', '')} {_FLAG}".strip()
-    from shapebody.runtime import enable_compilation_cache
-
-    enable_compilation_cache()
     try:
+        if options.command == "validate":
+            return _validate(options)
+        from shapebody.runtime import enable_compilation_cache
+
+        enable_compilation_cache()
         {
             "train": _train,
             "anneal": _anneal,
@@ -102,11 +108,10 @@ def _train(options):
     from shapebody.ppo import TrainConfig, as_continued, train
 
     changes = {"robots": tuple(options.robots)}
-    if options.name:
+    if options.name is not None:
         changes["name"] = options.name
     config = TrainConfig.at_scale(options.scale or scale(), options.robots[0], **changes)
-    config = as_continued(config)
-    seconds = None if options.hours is None else 3600 * options.hours
+    config, seconds = as_continued(config), _seconds(options)
     agent = train(
         config,
         max_steps=options.steps,
@@ -119,14 +124,20 @@ def _train(options):
         print(f"agent {agent.name}: {agent.metadata['steps']:,} steps")
 
 
+def _seconds(options) -> float | None:
+    """--hours in seconds."""
+    from shapebody.checks import require_number
+
+    return None if options.hours is None else 3600 * require_number("--hours", options.hours, 0)
+
+
 def _anneal(options):
     from shapebody.ppo import anneal
 
-    seconds = None if options.hours is None else 3600 * options.hours
     agent = anneal(
         options.agent,
         options.steps,
-        max_seconds=seconds,
+        max_seconds=_seconds(options),
         engine=options.engine,
         replace=options.replace,
     )
@@ -141,14 +152,14 @@ def _sharpen(options):
     from shapebody.networks import CriticConfig
     from shapebody.ppo import train_critic
 
-    agent = load_agent(options.agent)
+    seconds, agent = _seconds(options), load_agent(options.agent)
     full = agent.metadata.get("scale") == "full"
     sharper = train_critic(
         agent,
         CriticConfig() if full else CriticConfig.sharp(),
         options.steps,
         folder=agent_folder(options.agent),
-        max_seconds=None if options.hours is None else 3600 * options.hours,
+        max_seconds=seconds,
         engine=options.engine,
     )
     if sharper is agent:
@@ -170,7 +181,7 @@ def _design(options):
 
     robot = load_robot(options.robot)
     _check_out(options.out, robot)
-    agent = load_agent(options.agent or robot.name)
+    agent = load_agent(robot.name if options.agent is None else options.agent)
     _warn_of_another_robot(agent, robot)
     space = DesignSpace(robot)
     f = space.reference if options.start is None else space.start(options.start)
@@ -193,13 +204,11 @@ def _design(options):
 
 def _check_out(out, robot) -> None:
     """Before a search: whether its result can be written."""
-    from pathlib import Path
+    from shapebody.checks import require_output
 
     if out is None:
         return
-    path = Path(out)
-    if path.is_dir():
-        raise ValueError(f"--out is {out}, a folder; give the name of a file")
+    path = require_output("--out", out)
     if path.exists() and robot.path is not None and path.samefile(robot.path):
         raise ValueError(
             f"--out is {out}, the file of the robot itself, whose reference body would be lost; "
@@ -228,16 +237,15 @@ def _warn_of_another_robot(agent, robot) -> None:
 
 
 def _validate(options) -> int:
+    from shapebody.checks import require_output
     from shapebody.validation import validate_robot
 
+    if options.out is not None:
+        require_output("--out", options.out)
     report = validate_robot(options.robot)
     print(report)
-    if options.out:
-        try:
-            print(f"\nwrote {report.write(options.out)}")
-        except (ValueError, OSError) as error:
-            print(f"shapebody: {error}", file=sys.stderr)
-            return 1
+    if options.out is not None:
+        print(f"\nwrote {report.write(options.out)}")
     return 0 if report.ok else 1
 
 
@@ -250,7 +258,7 @@ def _evaluate(options):
     agent = load_agent(options.agent)
     # Its configuration has the files of robots that are not among the shipped ones.
     trained = agent.metadata.get("config", {}).get("robots", agent.robots)
-    robot = load_robot(options.robot or trained[0])
+    robot = load_robot(trained[0] if options.robot is None else options.robot)
     _warn_of_another_robot(agent, robot)
     space = DesignSpace(robot)
     f = space.reference if options.start is None else space.start(options.start)

@@ -3,6 +3,7 @@
 import jax
 import numpy as np
 
+from shapebody.checks import require_integer, require_kind, require_number, require_shape
 from shapebody.descriptions import describe
 from shapebody.design import DesignSpace
 from shapebody.evaluation import Evaluation, paired_gain
@@ -20,6 +21,10 @@ def large_changes(space: DesignSpace, f, limit: float = LARGE_CHANGE) -> list[st
     Raises:
         ValueError: for a design that is none of this space.
     """
+    require_kind("space", space, DesignSpace, "shapebody.DesignSpace(robot)")
+    require_number("limit", limit, 0)
+    if space.validate(f).ndim != 1:
+        raise ValueError(f"design has shape {np.shape(f)}; expected one design [{space.dim}]")
     both = np.stack([space.reference, space.validate(f)])
     told = jax.jit(describe(space.robot))(space(both))
     values = {"mass, kg": told.total_mass, "height of the IMU, m": told.imu_height}
@@ -49,6 +54,11 @@ def objections(walked: Evaluation, stood: Evaluation, row: int, reference: int =
     Raises:
         ValueError: if the two evaluations had other seeds or settings.
     """
+    for name, value in (("walked", walked), ("stood", stood)):
+        require_kind(name, value, Evaluation, "shapebody.evaluate(...)")
+        require_shape(f"{name}.returns", value.returns, ("S", "E"))
+    for name, value in (("row", row), ("reference", reference)):
+        require_integer(name, value, 0, len(walked.returns) - 1)
     paired_gain(walked, stood)  # refuses evaluations that cannot be compared
     sentences = []
     for other, before in (

@@ -6,6 +6,7 @@ import jax
 import mujoco
 import numpy as np
 
+from shapebody.checks import require_integer, require_list, require_seed, shown
 from shapebody.design import DesignSpace
 from shapebody.mjcf import standing_pose
 from shapebody.physics.native import NativePhysics
@@ -30,8 +31,7 @@ def robot_table(names: Sequence[str] | None = None) -> list[dict]:
         height (m, of the trunk's origin in the home pose).
     """
     rows = []
-    for name in robots() if names is None else names:
-        robot = load_robot(name)
+    for robot in _loaded(names):
         rows.append(
             {
                 "name": robot.name,
@@ -50,6 +50,14 @@ def robot_table(names: Sequence[str] | None = None) -> list[dict]:
             }
         )
     return rows
+
+
+def _loaded(names) -> list[Robot]:
+    """The robots of these names, all shipped ones if None."""
+    names = robots() if names is None else require_list("names", names, 1000)
+    if not names:
+        raise ValueError("names is empty; expected at least one robot, see shapebody.robots()")
+    return [load_robot(name) for name in names]
 
 
 def random_bodies(robot: Robot, designs: int = 200, control_steps: int = 50, seed: int = 0) -> dict:
@@ -73,6 +81,9 @@ def random_bodies(robot: Robot, designs: int = 200, control_steps: int = 50, see
         least one joint whose limits have crossed (`mjcf.ordered_ranges`).
     """
     space = DesignSpace(robot)
+    require_integer("designs", designs, 1, 100_000)
+    require_integer("control_steps", control_steps, 1, 1_000_000)
+    require_seed("seed", seed)
     f = np.stack([space.start(seed + i) for i in range(designs)])
     bodies = jax.tree.map(np.asarray, jax.jit(jax.vmap(space))(f))
     physics = NativePhysics(robot, designs)
@@ -132,7 +143,10 @@ def group_scene(names: Sequence[str] | None = None, rows: int = 4):
     Returns:
         (model, qpos [nq], order), the last with the names from front left to back right.
     """
-    crowd = [load_robot(name) for name in (robots() if names is None else names)]
+    require_integer("rows", rows, 1, 1000)
+    crowd = _loaded(names)
+    if len({robot.name for robot in crowd}) < len(crowd):
+        raise ValueError(f"names is {shown(names)}; expected robots of different names")
     boxes = {robot.name: _bounding_box(robot) for robot in crowd}
     crowd.sort(key=lambda robot: boxes[robot.name][1, 2])
     spec = _empty_scene()
@@ -172,8 +186,10 @@ def gallery(
     names: Sequence[str] | None = None, rows: int = 4, height: int = 520, width: int = 1400
 ) -> np.ndarray:
     """Picture uint8[height, width, 3] of `group_scene`."""
-    from shapebody.video import Renderer
+    from shapebody.video import Renderer, require_size
 
+    require_integer("rows", rows, 1, 1000)
+    require_size(height, width)
     model, qpos, _ = group_scene(names, rows)
     with Renderer(model, height, width, smooth=True) as renderer:
         return renderer.picture(qpos, azimuth=180.0, elevation=-20.0)

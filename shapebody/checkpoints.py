@@ -35,7 +35,7 @@ import jax
 import numpy as np
 import safetensors.numpy
 
-from .checks import require_kind
+from .checks import require_kind, require_list, require_name, require_path, shown
 from .descriptions import Descriptions, Sizes
 from .files import (
     PENDING,
@@ -58,6 +58,7 @@ from .networks import (
     Policy,
     PolicyConfig,
     initialize,
+    require_inputs,
 )
 from .paths import data_dir
 from .stored import (
@@ -66,9 +67,7 @@ from .stored import (
     read_json,
     read_npz,
     read_safetensors,
-    require_file,
-    require_folder_name,
-    shortened,
+    require_regular_file,
 )
 
 __all__ = [
@@ -134,10 +133,12 @@ class Agent:
 
     def act(self, descriptions: Descriptions, observation: Observation):
         """Action means [..., J], in units of the action scale."""
+        require_inputs(descriptions, observation)
         return _mean_action(self.policy_config)(self.policy, descriptions, observation)
 
     def values(self, descriptions: Descriptions, observation: Observation):
         """Values [..., K] of the critic's heads."""
+        require_inputs(descriptions, observation)
         return _values(self.critic_config)(self.critic, descriptions, observation)
 
     @functools.cached_property
@@ -229,9 +230,24 @@ def _commit() -> str | None:
 # ---------------------------------------------------------------------- agents
 
 
-def require_agent(agent) -> None:
-    """TypeError if it is no `Agent`, for example the name of one."""
-    require_kind("agent", agent, Agent, "load it with shapebody.load_agent(...)")
+def require_agent(agent) -> Agent:
+    """The argument; TypeError if it is no `Agent`, for example the name of one."""
+    return require_kind("agent", agent, Agent, "load it with shapebody.load_agent(...)")
+
+
+def chosen_folder(folder, name: str) -> Path:
+    """The folder that is given, or `data/checkpoints/<name>` if that is None."""
+    if folder is None:
+        return data_dir() / "checkpoints" / require_name("name", name)
+    return require_path("folder", folder)
+
+
+def _curve_rows(curve) -> list:
+    """The rows of a learning curve; ValueError if they are none."""
+    rows = require_list("curve", curve)
+    for number, row in enumerate(rows):
+        require_kind(f"row {number} of curve", row, Mapping, "a dictionary by column")
+    return rows
 
 
 def agents() -> list[str]:
@@ -261,9 +277,10 @@ def save_agent(
         ValueError: if shapes do not fit the configurations, or metadata cannot be written as JSON.
     """
     check_agent(agent)
-    folder = data_dir() / "checkpoints" / agent.name if folder is None else Path(folder)
+    folder = chosen_folder(folder, agent.name)
     if folder.exists() and not folder.is_dir():
         raise ValueError(f"folder is {str(folder)!r}, a file; give the name of a folder")
+    curve = None if curve is None else _curve_rows(curve)
     weights = _flat_weights(agent)
     states = _flat_states(agent)
     configuration = {
@@ -346,12 +363,12 @@ def _load(folder: Path) -> Agent:
         policy_config = from_plain(PolicyConfig, document["policy_config"], "policy_config")
         critic_config = from_plain(CriticConfig, document["critic_config"], "critic_config")
         name, robots, metadata = (document[x] for x in ("name", "robots", "metadata"))
-        require_folder_name("name", name)
+        require_name("name", name)
         if not isinstance(robots, list) or not all(isinstance(x, str) and x for x in robots):
-            raise ValueError(f"robots is {shortened(robots)}; expected a list of names")
+            raise ValueError(f"robots is {shown(robots)}; expected a list of names")
         for kind in ("hash", "states_hash", "configuration_hash"):
             if not isinstance(document[kind], str | None if kind == "states_hash" else str):
-                raise ValueError(f"{kind} is {shortened(document[kind])}; expected a text")
+                raise ValueError(f"{kind} is {shown(document[kind])}; expected a text")
         _check_metadata(metadata)
         _check_sizes(sizes, policy_config, critic_config)
     except (TypeError, ValueError) as error:
@@ -369,7 +386,7 @@ def _load(folder: Path) -> Agent:
         for key, (_, dtype) in header.items():
             if dtype != np.float32 or not key.startswith(tuple(modules)):
                 raise ValueError(
-                    f"{folder / WEIGHTS} has {shortened(key)} of type {dtype}, expected float32 "
+                    f"{folder / WEIGHTS} has {shown(key)} of type {dtype}, expected float32 "
                     f"numbers of {' and '.join(modules)} alone; {restore}"
                 )
 
@@ -440,7 +457,8 @@ def load_curve(name_or_folder: str | Path) -> dict[str, np.ndarray]:
 
 def check_agent(agent: Agent) -> None:
     """Raise ValueError if the parts of an agent do not fit together, or are too large."""
-    require_folder_name("the agent's name", agent.name)
+    require_agent(agent)
+    require_name("the name of the agent", agent.name)
     _check_sizes(agent.sizes, agent.policy_config, agent.critic_config)
     if not agent.robots:
         raise ValueError(f"agent {agent.name!r} names no robots; give at least one")
@@ -483,28 +501,22 @@ def check_agent(agent: Agent) -> None:
 
 def agent_folder(name_or_folder: str | Path) -> Path:
     """The folder of an agent that is given as in `load_agent`; raises what that raises."""
-    if not isinstance(name_or_folder, str | Path):
-        raise TypeError(
-            f"the agent is {shortened(name_or_folder)}; expected a name or a folder, as a text or "
-            "Path"
-        )
+    folder = require_path("agent", name_or_folder)
     text = str(name_or_folder)
     if isinstance(name_or_folder, Path) or os.sep in text or "/" in text:
-        folder = Path(name_or_folder).expanduser()
-        if not os.path.isdir(folder):
+        if not folder.is_dir():
             raise FileNotFoundError(
-                f"agent folder {shortened(text)} does not exist (looked at "
-                f"{os.path.abspath(folder)[:300]}): give an existing folder, or one of the names "
-                "of shapebody.checkpoints.agents()"
+                f"agent folder {shown(text)} does not exist (looked at {folder.absolute()}): give "
+                "an existing folder, or one of the names of shapebody.checkpoints.agents()"
             )
         return folder
     known = agents()
     if text not in known:
-        close = difflib.get_close_matches(text, known, n=1)
+        close = difflib.get_close_matches(text[:100], known, n=1)
         hint = f"; did you mean {close[0]!r}?" if close else "."
         listing = ", ".join(known) if known else "none"
         raise ValueError(
-            f"there is no agent {shortened(text)} in {data_dir() / 'checkpoints'}{hint} "
+            f"there is no agent {shown(text)} in {data_dir() / 'checkpoints'}{hint} "
             f"Available agents: {listing}"
         )
     return data_dir() / "checkpoints" / text
@@ -535,18 +547,18 @@ def _restore(folder: Path) -> str:
 
 def _read_description(folder: Path) -> dict:
     path = current(folder, DESCRIPTION)
-    require_file(path, f"{folder} is no agent, or its files were copied incompletely")
+    require_regular_file(path, f"{folder} is no agent, or its files were copied incompletely")
     restore = _restore(folder)
     try:
         document = read_json(path, restore)
         if not isinstance(document, dict) or "format" not in document:
-            raise ValueError(f"it holds {shortened(document)} without a format; {restore}")
+            raise ValueError(f"it holds {shown(document)} without a format; {restore}")
     except ValueError as error:
         raise ValueError(f"{path} is not a valid agent description: {error}") from error
     number = document["format"]
     if number != FORMAT:
         raise ValueError(
-            f"{path} has format {shortened(number)}, expected {FORMAT}; use the version of "
+            f"{path} has format {shown(number)}, expected {FORMAT}; use the version of "
             "shapebody that wrote it, or train anew"
         )
     return document
@@ -569,20 +581,20 @@ def _check_metadata(metadata) -> None:
 
     def check(values, what):
         if not isinstance(values, dict):
-            raise ValueError(f"{what} is {shortened(values)}; expected an object")
+            raise ValueError(f"{what} is {shown(values)}; expected an object")
         for name, (kind, words) in _METADATA.items():
             value = values.get(name)
             if name in values and (not isinstance(value, kind) or isinstance(value, bool)):
-                raise ValueError(f"{what}.{name} is {shortened(value)}; expected {words}")
+                raise ValueError(f"{what}.{name} is {shown(value)}; expected {words}")
 
     check(metadata, "metadata")
     check(metadata.get("policy_evaluation", {}), "metadata.policy_evaluation")
     robots = metadata.get("config", {}).get("robots", ["?"])
     if not (isinstance(robots, list) and robots and all(isinstance(x, str) for x in robots)):
-        raise ValueError(f"metadata.config.robots is {shortened(robots)}; expected a list of names")
+        raise ValueError(f"metadata.config.robots is {shown(robots)}; expected a list of names")
     for phase in metadata.get("phases", []):
         if not isinstance(phase, dict) or not isinstance(phase.get("robots", {}), dict):
-            raise ValueError(f"metadata.phases has {shortened(phase)}; expected objects")
+            raise ValueError(f"metadata.phases has {shown(phase)}; expected objects")
 
 
 def _check_sizes(sizes: Sizes, policy: PolicyConfig, critic: CriticConfig) -> None:
@@ -656,9 +668,9 @@ def _check_shapes(
     shapes: Mapping[str, tuple], expected: Mapping[str, tuple], what: str, fix: str
 ) -> None:
     problems = [f"{name} is missing" for name in expected if name not in shapes]
-    problems += [f"{shortened(name)} is unknown" for name in shapes if name not in expected]
+    problems += [f"{shown(name)} is unknown" for name in shapes if name not in expected]
     problems += [
-        f"{name} has shape {shortened(shapes[name])}, expected {shape}"
+        f"{name} has shape {shown(shapes[name])}, expected {shape}"
         for name, shape in expected.items()
         if name in shapes and shapes[name] != shape
     ]

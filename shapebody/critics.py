@@ -6,6 +6,14 @@ The controls are the same start designs (Section 4.1), and the pull of the trust
 import numpy as np
 
 from shapebody.checkpoints import require_agent
+from shapebody.checks import (
+    require_integer,
+    require_kind,
+    require_list,
+    require_number,
+    require_records,
+    require_seed,
+)
 from shapebody.design import DesignSpace
 from shapebody.evaluation import EvaluationConfig, evaluate, paired_gain
 from shapebody.experiments import rank_correlation, result, result_in_parts
@@ -41,8 +49,14 @@ def compare_critics(
     Raises:
         ValueError: if the critics belong to different policies.
     """
-    for agent in critics.values():
-        require_agent(agent)
+    _require_critics(critics)
+    trust_regions = require_list("trust_regions", trust_regions)
+    for value in trust_regions:
+        require_number("a number in trust_regions", value, 0)
+    for name, value in (("starts", starts), ("episodes", episodes), ("horizon", horizon)):
+        require_integer(name, value, 1, 1_000_000)
+    require_integer("first_start", first_start)
+    require_seed("seed", seed)
     policies = {agent.policy_hash for agent in critics.values()}
     if len(policies) != 1:
         raise ValueError(
@@ -79,6 +93,14 @@ def compare_critics(
     ]
 
 
+def _require_critics(critics) -> None:
+    require_kind("critics", critics, dict, "agents by name")
+    if not critics:
+        raise ValueError("critics is {}; expected at least one agent by name")
+    for agent in critics.values():
+        require_agent(agent)
+
+
 def critic_gains(records: list[dict]) -> list[dict]:
     """What each critic adds to the penalty alone, from the records of `compare_critics`.
 
@@ -89,8 +111,11 @@ def critic_gains(records: list[dict]) -> list[dict]:
         whose gain is None.
     """
     groups: dict = {}
-    for record in records:
+    columns = ("critic", "trust_region", "returns", "tracking_error", "length", "size")
+    for record in require_records("records", records, columns):
         groups.setdefault((record["critic"], record["trust_region"]), []).append(record)
+    if (None, None) not in groups:
+        raise ValueError("records hold no penalty alone; expected those of compare_critics")
     control = [record["returns"] for record in groups[None, None]]
     rows = []
     for (critic, value), group in groups.items():
@@ -114,7 +139,10 @@ def critic_correlations(critics: dict, robot, records: list[dict]) -> dict[str, 
         records: of `studies.value_against_return` for the policy that all critics share; the
             designs and the returns in them do not depend on a critic.
     """
+    _require_critics(critics)
     space = DesignSpace(robot)
+    if len(require_records("records", records, ("design", "return"))) < 3:
+        raise ValueError(f"records has {len(records)} entries; expected three or more")
     designs = np.stack([space.start(record["design"]) for record in records])
     returns = [record["return"] for record in records]
     return {

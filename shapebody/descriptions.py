@@ -15,13 +15,16 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
+from shapebody.checks import require_integer, require_kind
 from shapebody.design import Embodiment, quaternion_product
 from shapebody.parameters import soft_limits
-from shapebody.robots import Robot
+from shapebody.robots import Robot, require_robot
 
 JOINT_DESCRIPTION = 30
 FOOT_DESCRIPTION = 21
 FOOT_SIZE_SCALE = 0.15  # m
+MOST_PARTS = 10_000
+"""Joints, feet or spheres of a robot."""
 
 
 @jax.tree_util.register_dataclass
@@ -51,9 +54,17 @@ class Sizes:
     feet: int
     spheres: int
 
+    def __post_init__(self):
+        for name, least in (("joints", 1), ("feet", 1), ("spheres", 0)):
+            require_integer(name, getattr(self, name), least, MOST_PARTS)
+
     @staticmethod
     def of(*robots: Robot) -> Sizes:
         """The smallest sizes that fit all `robots`."""
+        if not robots:
+            raise ValueError("robots is (); expected at least one Robot")
+        for robot in robots:
+            require_robot(robot)
         return Sizes(
             joints=max(robot.num_actuators for robot in robots),
             feet=max(robot.num_feet for robot in robots),
@@ -219,7 +230,7 @@ def kinematics(robot: Robot) -> Callable[[Embodiment, jax.Array], Frames]:
 
     Agrees with MuJoCo's `mj_kinematics` (which also normalizes the free joint's quaternion).
     """
-    model = robot.model
+    model = require_robot(robot).model
     tree = _tree(robot)
     geom_rot = _constant_rotations(model.geom_quat)
     site_rot = _constant_rotations(model.site_quat)
@@ -257,7 +268,7 @@ def symmetric_feet(robot: Robot) -> np.ndarray:
 
     Two feet form a pair if each is the other's nearest in (x, |y|, z), in the reference home pose.
     """
-    model, data = robot.model, mujoco.MjData(robot.model)
+    model, data = require_robot(robot).model, mujoco.MjData(robot.model)
     data.qpos[:] = robot.home
     mujoco.mj_kinematics(model, data)
     trunk_rot = data.xmat[robot.trunk].reshape(3, 3)
@@ -280,7 +291,7 @@ def describe(robot: Robot, sizes: Sizes | None = None) -> Callable[[Embodiment],
     Raises ValueError if `sizes` are smaller than the robot's.
     """
     own = Sizes.of(robot)
-    sizes = own if sizes is None else sizes
+    sizes = own if sizes is None else require_kind("sizes", sizes, Sizes, "Sizes.of(*robots)")
     for name in ("joints", "feet", "spheres"):
         if getattr(sizes, name) < getattr(own, name):
             raise ValueError(

@@ -15,7 +15,14 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
-from shapebody.checks import require_integer
+from shapebody.checks import (
+    require_array,
+    require_integer,
+    require_kind,
+    require_list,
+    require_seed,
+    require_text,
+)
 from shapebody.mjcf import build_model, write_mjcf
 from shapebody.parameters import (
     BLOCKS,
@@ -65,6 +72,8 @@ class Embodiment:
     action_scale: jax.Array  # [] rad
 
 
+MOST_STARTS = 2**63
+"""Numbers of start designs are below this."""
 CONTROL_FIELDS = ("nominal", "velocity_limits", "p_gain", "d_gain", "action_scale")
 MODEL_FIELDS = tuple(
     field.name for field in dataclasses.fields(Embodiment) if field.name not in CONTROL_FIELDS
@@ -77,6 +86,10 @@ def rotation_axes(generator: np.random.Generator, joint_axes: np.ndarray, num_bo
     Returns unit vectors (inertia [nb, 3], body [nb, 3], joint [nj, 3]), the last perpendicular to
     the reference `joint_axes` [nj, 3].
     """
+
+    require_kind("generator", generator, np.random.Generator, "numpy.random.default_rng(0)")
+    joint_axes = require_array("joint_axes", joint_axes, ("nj", 3))
+    require_integer("num_bodies", num_bodies, 1, 10**6)
 
     def normalized(vectors):
         return vectors / np.linalg.norm(vectors, axis=1, keepdims=True)
@@ -97,12 +110,15 @@ def rotation_axes(generator: np.random.Generator, joint_axes: np.ndarray, num_bo
 
 def published_axes_seed(f) -> int:
     """The generator seed that the published designs derive from their own f [d] (float32)."""
-    total = abs(float(np.sum(np.asarray(f, np.float32).astype(np.float64))))
+    with np.errstate(over="ignore"):  # becomes inf, which is told
+        f = require_array("f", require_array("f", f).astype(np.float32))
+    total = abs(float(np.sum(f.astype(np.float64))))
     return int(total * 1e6) ^ 0x5A5A5A5A
 
 
 def published_axes(robot: Robot, f):
     """Rotation axes (inertia, body, joint) that the published design f [d] was built with."""
+    require_array("f", f, (require_robot(robot).design_dim,))
     generator = np.random.default_rng(published_axes_seed(f))
     return rotation_axes(generator, robot.model.jnt_axis[robot.joints], robot.num_bodies)
 
@@ -161,7 +177,7 @@ class DesignSpace:
         self.dim = offset
         self.reference = np.zeros(self.dim, np.float32)
         if published_axes_of is None:
-            generator = np.random.default_rng(axes_seed)
+            generator = np.random.default_rng(require_seed("axes_seed", axes_seed))
             axes = rotation_axes(generator, robot.model.jnt_axis[robot.joints], robot.num_bodies)
         else:
             axes = published_axes(robot, self._one(published_axes_of))
@@ -187,19 +203,12 @@ class DesignSpace:
 
     def start(self, seed: int) -> np.ndarray:
         """Start design number `seed` of the paper: float32 [d], uniform in [-1, 1]."""
-        require_integer("the number of a start design", seed)
+        require_integer("the number of a start design", seed, 0, MOST_STARTS)
         return np.random.default_rng(seed).uniform(-1, 1, self.dim).astype(np.float32)
 
     def validate(self, f) -> np.ndarray:
         """Return f as float32 [..., d]; ValueError if its length, finiteness or box is wrong."""
-        try:
-            f = np.asarray(f, np.float32)
-        except (TypeError, ValueError) as error:
-            raise ValueError(
-                f"design is {f!r}, expected {self.dim} numbers; use a design of robot "
-                f"{self.robot.name!r}, such as space.start(0)"
-            ) from error
-        self._check_length(f)
+        f = self._float32(f, np)
         if not np.all(np.isfinite(f)):
             where = np.argwhere(~np.isfinite(f))[0]
             raise ValueError(
@@ -214,17 +223,28 @@ class DesignSpace:
             )
         return f
 
-    def _check_length(self, f):
+    def _float32(self, f, numpy):
+        """Designs [..., d] as float32, an array of `numpy` (or jax.numpy: also a traced one)."""
+        if not isinstance(f, jax.Array):
+            try:
+                f = require_array("design", f, finite=False)
+            except ValueError as error:
+                raise ValueError(
+                    f"{error}, {self.dim} of them; use a design of robot {self.robot.name!r}, such "
+                    "as space.start(0)"
+                ) from None
+        with np.errstate(over="ignore"):  # becomes inf, which is told
+            f = numpy.asarray(f, numpy.float32)
         if f.ndim == 0 or f.shape[-1] != self.dim:
             raise ValueError(
                 f"design has shape {f.shape}, expected [..., {self.dim}] for robot "
                 f"{self.robot.name!r}; use a design of this robot, such as space.start(0)"
             )
+        return f
 
     def __call__(self, f) -> Embodiment:
         """Φ(f): embodiment of designs f [..., d]."""
-        f = jnp.asarray(f, jnp.float32)
-        self._check_length(f)
+        f = self._float32(f, jnp)
         function = self._jitted
         for _ in range(f.ndim - 1):
             function = jax.vmap(function)
@@ -297,7 +317,8 @@ class DesignSpace:
             ValueError: for a name that is neither; the known ones are listed.
         """
         chosen = np.zeros(self.dim, bool)
-        for name in (names,) if isinstance(names, str) else names:
+        for name in (names,) if isinstance(names, str) else require_list("names", names):
+            require_text("a name of parameters", name)
             known = self.slices if name in self.slices else self.groups
             if name not in known:
                 raise ValueError(

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-import numbers
 import time
 from dataclasses import dataclass, field
 from typing import NamedTuple
@@ -14,7 +13,16 @@ import jax.numpy as jnp
 import numpy as np
 
 from shapebody.checkpoints import Agent, require_agent
-from shapebody.checks import require_integer, require_kind
+from shapebody.checks import (
+    refuse,
+    require_array,
+    require_engine,
+    require_flag,
+    require_integer,
+    require_kind,
+    require_number,
+    require_seed,
+)
 from shapebody.design import DesignSpace
 from shapebody.locomotion import Locomotion, TaskConfig
 from shapebody.locomotion.env import RESET_SLOTS
@@ -23,6 +31,7 @@ from shapebody.robots import Robot
 
 CONFIDENCE = 0.95
 RESAMPLES = 10_000
+MOST_EPISODES, MOST_RESAMPLES = 1_000_000, 1_000_000
 _CALLS = 50  # control steps between reports, and per call of an engine that runs whole rollouts
 
 
@@ -44,9 +53,9 @@ class EvaluationConfig:
 
     def __post_init__(self):
         for name in ("episodes", "num_envs"):
-            require_integer(name, getattr(self, name), 1)
-        if not isinstance(self.coefficient, numbers.Real) or not 0 <= self.coefficient <= 1:
-            raise ValueError(f"coefficient is {self.coefficient!r}; expected a number in [0, 1]")
+            require_integer(name, getattr(self, name), 1, MOST_EPISODES)
+        require_number("coefficient", self.coefficient, 0, 1)
+        require_flag("recompute_constants", self.recompute_constants)
         require_kind("task", self.task, TaskConfig, "TaskConfig.evaluation(...)")
 
 
@@ -146,11 +155,13 @@ def evaluate(
             of episodes, an unknown engine.
     """
     require_agent(agent)
-    config = config or EvaluationConfig()
+    config = EvaluationConfig() if config is None else config
     require_kind("config", config, EvaluationConfig, "shapebody.EvaluationConfig(...)")
     if episodes is not None:
         config = dataclasses.replace(config, episodes=episodes)
-    require_integer("seed", seed)
+    require_seed("seed", seed)
+    require_engine("engine", engine)
+    require_flag("progress", progress)
     space = DesignSpace(robot)
     designs = space.validate(designs)
     if designs.ndim > 2 or len(designs) == 0:
@@ -389,9 +400,17 @@ def bootstrap_interval(
             outside (0, 1).
     """
     values = _differences(values, baseline)
+    _require_resampling(confidence, resamples, seed)
     weights = _resampled(np.random.default_rng(seed), values.shape[-1], resamples)
     low, high = _percentiles(values @ weights.T, confidence)
     return _out(low), _out(high)
+
+
+def _require_resampling(confidence, resamples, seed) -> None:
+    if require_number("confidence", confidence, 0, 1) in (0, 1):
+        raise ValueError(f"confidence is {confidence!r}; expected a number between 0 and 1")
+    require_integer("resamples", resamples, 1, MOST_RESAMPLES)
+    require_seed("seed", seed)
 
 
 def _resampled(rng, n: int, resamples: int):
@@ -400,8 +419,6 @@ def _resampled(rng, n: int, resamples: int):
 
 
 def _percentiles(means, confidence: float):
-    if not 0 < confidence < 1:
-        raise ValueError(f"confidence is {confidence!r}; expected a number between 0 and 1")
     tail = (1 - confidence) / 2
     return np.quantile(means, [tail, 1 - tail], axis=-1)
 
@@ -441,11 +458,11 @@ def paired_gain(
                     f"the evaluations differ in {name}: {after.settings[name]!r} and "
                     f"{before.settings[name]!r}; repeat one with the settings of the other"
                 )
-    after, before = (
-        np.asarray(x.returns if isinstance(x, Evaluation) else x, np.float64)
-        for x in (after, before)
-    )
-    differences = _differences(after, before)
+    _require_resampling(confidence, resamples, seed)
+    after, before = (x.returns if isinstance(x, Evaluation) else x for x in (after, before))
+    if before is None:
+        raise refuse("before", before, "an evaluation or an array of numbers")
+    differences = _differences(after, before, ("after", "before"))
     if differences.ndim > 2:
         raise ValueError(f"returns have shape {differences.shape}; expected [E] or [S, E]")
     if differences.ndim == 1:
@@ -461,21 +478,18 @@ def paired_gain(
     return Gain(float(differences.mean()), low, high, differences)
 
 
-def _differences(values, baseline):
-    values = np.asarray(values, np.float64)
-    if values.ndim == 0 or values.shape[-1] == 0:
-        raise ValueError(f"values have shape {values.shape}; expected [..., n] with n >= 1")
-    if baseline is not None:
-        baseline = np.asarray(baseline, np.float64)
-        if baseline.shape != values.shape:
-            raise ValueError(
-                f"values {values.shape} and baseline {baseline.shape} have different shapes; "
-                "paired numbers need the same"
-            )
-        values = values - baseline
-    if not np.isfinite(values).all():
-        raise ValueError("values contain numbers that are not finite; remove or replace them")
-    return values
+def _differences(values, baseline, names=("values", "baseline")):
+    """values - baseline, float64 [..., n]; ValueError naming the argument that is wrong."""
+    values = require_array(names[0], values, ("...", "n")).astype(np.float64)
+    if baseline is None:
+        return values
+    baseline = require_array(names[1], baseline).astype(np.float64)
+    if baseline.shape != values.shape:
+        raise ValueError(
+            f"{names[0]} {values.shape} and {names[1]} {baseline.shape} have different shapes; "
+            "paired numbers need the same"
+        )
+    return values - baseline
 
 
 def _out(value):

@@ -6,6 +6,13 @@ None means "not tried yet". Answers that are functions may be called with any va
 
 import numpy as np
 
+from shapebody.checks import (
+    require_array,
+    require_integer,
+    require_kind,
+    require_number,
+)
+
 
 def _waiting(answer, task: str) -> bool:
     if answer is None:
@@ -22,6 +29,12 @@ def _is_function(answer, task: str) -> bool:
         print("Not yet. Hand over the function itself, without calling it.")
         return False
     return True
+
+
+def _require_space(space) -> None:
+    from shapebody.design import DesignSpace
+
+    require_kind("space", space, DesignSpace, "shapebody.DesignSpace(robot)")
 
 
 def _say(right: bool, praise: str, hint: str) -> None:
@@ -116,6 +129,9 @@ def check_trust_regions(results) -> None:
 
 def check_largest_step(answer, result) -> None:
     """Exercise: the largest change of one design parameter in one iteration of a search."""
+    from shapebody.search import SearchResult
+
+    require_kind("result", result, SearchResult, "shapebody.search(...)")
     if _waiting(answer, "the largest change of any parameter between two rows of the trajectory."):
         return
     answer = _number(answer)
@@ -143,6 +159,7 @@ def check_total_mass(function, space) -> None:
 
     function: x -> kg, without calling Φ.
     """
+    _require_space(space)
     if not _is_function(
         function, "write a function of x and hand the function over, not a number."
     ):
@@ -168,6 +185,8 @@ def check_total_mass(function, space) -> None:
 
 def check_heavier(f, space, kilograms: float = 1.0) -> None:
     """Exercise: the design nearest to the reference that is `kilograms` heavier."""
+    _require_space(space)
+    require_number("kilograms", kilograms)
     if _waiting(f, "use the gradient of the total mass at the reference, and a step along it."):
         return
     try:
@@ -307,6 +326,7 @@ def check_reward(function) -> None:
 
 def check_successes(answer, levels: int = 100) -> None:
     """Exercise: successes in a row that raise the curriculum coefficient from 0 to 1."""
+    require_integer("levels", levels, 1)
     if _waiting(answer, "the number of successful episodes in a row."):
         return
     answer = _number(answer)
@@ -378,6 +398,7 @@ def check_gae(function) -> None:
 
 def check_surrogate(function, clip_range: float = 0.1) -> None:
     """Exercise: the clipped surrogate of PPO. function: (ratio, advantage) -> gain, arrays."""
+    require_number("clip_range", clip_range, 0, 1)
     if not _is_function(function, "write the function and hand it over."):
         return
     ratio, advantage = (
@@ -409,6 +430,7 @@ def check_surrogate(function, clip_range: float = 0.1) -> None:
 
 def check_step(function, max_update: float = 0.1) -> None:
     """Exercise: the two clips of eq. (7). function: (f [d], Adam's step [d]) -> next design [d]."""
+    require_number("max_update", max_update, above=0)
     if not _is_function(function, "write the function and hand it over."):
         return
     f = np.array([0.0, 0.0, 0.0, 0.95, 0.95, -0.95, 0.98, 1.0, 1.0, -1.0])
@@ -436,6 +458,7 @@ def check_radius(function, dim: int = 358) -> None:
 
     function: (one entry g of the value gradient, λ) -> |f - f_ref| where it balances the penalty.
     """
+    require_integer("dim", dim, 1)
     if not _is_function(function, "write a function (g, λ) and hand it over."):
         return
     for g, trust_region in ((0.1, 20.0), (-0.1, 100.0), (0.02, 50.0), (5.0, 20.0)):
@@ -493,11 +516,12 @@ def check_per_motor(answer) -> None:
         print(f"Not yet. The answer is {_shown(answer)}; it should be the name of one robot.")
         return
     from shapebody.catalog import robot_table
+    from shapebody.robots import robots
 
-    ratios = {row["name"]: row["design_dim"] / row["actuators"] for row in robot_table()}
-    if answer not in ratios:
-        print(f"Not yet. There is no robot {answer!r}; use a name of sb.robots().")
+    if answer not in robots():
+        print(f"Not yet. There is no robot {_shown(answer)}; use a name of sb.robots().")
         return
+    ratios = {row["name"]: row["design_dim"] / row["actuators"] for row in robot_table()}
     best = max(ratios, key=ratios.get)
     _say(
         answer == best,
@@ -512,6 +536,9 @@ def check_per_motor(answer) -> None:
 
 def check_knee_torque(answer, robot) -> None:
     """Exercise: torque in N m at the last hinge of a leg, with the weight shared by all feet."""
+    from shapebody.robots import require_robot
+
+    require_robot(robot)
     if _waiting(answer, "one number in N m."):
         return
     answer = _number(answer)
@@ -568,6 +595,9 @@ def check_twelve_motors(path) -> None:
         report = validate_robot(path)
     except TypeError:
         print(f"Not yet. Hand over the path of the file, not {type(path).__name__}.")
+        return
+    except ValueError as error:
+        print(f"Not yet. {error}")
         return
     problem = report.problems[0] if report.problems else _lift_problem(report.robot)
     if problem:
@@ -674,6 +704,10 @@ def check_held_out(answer, gains, trust_regions) -> None:
     answer: (λ, its mean gain on the first half, its mean gain on the other starts).
     gains: [λ, start]. trust_regions: the λ of its rows.
     """
+    gains = require_array("gains", gains, ("λ", "start")).astype(float)
+    rows = require_array("trust_regions", trust_regions, (len(gains),)).astype(float)
+    if gains.shape[1] < 2:
+        raise ValueError(f"gains has shape {gains.shape}; expected two or more starts")
     if _waiting(answer, "three numbers (λ, mean on the first half, mean on the second half)."):
         return
     given = _numbers(answer, 3)
@@ -682,8 +716,7 @@ def check_held_out(answer, gains, trust_regions) -> None:
         return
     from itertools import combinations
 
-    gains, trust_regions = np.asarray(gains, float), np.asarray(trust_regions, float)
-    count = gains.shape[1]
+    trust_regions, count = rows, gains.shape[1]
 
     def halves(chosen):
         inside = np.isin(np.arange(count), chosen)
@@ -951,6 +984,7 @@ def check_covered(function, trajectory) -> None:
     function: (trajectory [N + 1, d] of one start) -> n, the first with
     |f_n - f_N| <= 0.1 |f_0 - f_N|. trajectory: [N + 1, S, d] of a search, to say what it finds.
     """
+    trajectory = require_array("trajectory", trajectory, ("n", "S", "d")).astype(float)
     if not _is_function(function, "write the function and hand it over."):
         return
 
@@ -964,7 +998,7 @@ def check_covered(function, trajectory) -> None:
     slow = 0.3 + rates * generator.uniform(-0.5, 0.5, 5)
     turns = np.cos(0.4 * np.arange(41)) * 0.93 ** np.arange(41)
     swinging = np.outer(turns, generator.uniform(-0.5, 0.5, 5)) - 0.2
-    real = np.asarray(trajectory, float)
+    real = trajectory
     for path in (slow, swinging, *np.moveaxis(real, 1, 0)):
         given = function(path.copy())
         if given is None:

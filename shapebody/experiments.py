@@ -1,5 +1,6 @@
 """Scales, agents to use at each, and experiments whose results are kept with their provenance."""
 
+import io
 import json
 import os
 import shutil
@@ -10,9 +11,24 @@ from pathlib import Path
 
 import numpy as np
 
+from shapebody.checks import (
+    require_array,
+    require_choice,
+    require_flag,
+    require_function,
+    require_integer,
+    require_kind,
+    require_list,
+    require_name,
+    require_number,
+    require_output,
+    require_path,
+    require_seed,
+    shown,
+)
 from shapebody.files import atomic_write, locked
 from shapebody.paths import data_dir
-from shapebody.stored import read_json, require_folder_name, shortened
+from shapebody.stored import read_json
 
 
 @dataclass(frozen=True)
@@ -52,9 +68,7 @@ BUDGETS = {
 def scale() -> str:
     """The scale in force: SHAPEBODY_SCALE, "smoke", "reduced" (the default) or "full"."""
     value = os.environ.get("SHAPEBODY_SCALE") or "reduced"
-    if value not in BUDGETS:
-        raise ValueError(f"SHAPEBODY_SCALE is {value!r}; expected one of {', '.join(BUDGETS)}")
-    return value
+    return require_choice("SHAPEBODY_SCALE", value, BUDGETS)
 
 
 def budget() -> Budget:
@@ -77,6 +91,7 @@ def trained_robots(robots) -> list[str]:
     """Those of `robots` that have a shipped agent, in that order."""
     from shapebody.checkpoints import agents
 
+    robots = [require_name("a name in robots", name) for name in require_list("robots", robots)]
     known = agents()
     return [name for name in robots if agent_name(name) in known]
 
@@ -86,7 +101,7 @@ def agent_name(robot: str) -> str:
     the paper's networks where there is one. `smoke` uses the reduced agent."""
     from shapebody.checkpoints import agents
 
-    full = f"{robot}_full"
+    full = f"{require_name('robot', robot)}_full"
     return full if scale() == "full" and full in agents() else robot
 
 
@@ -96,6 +111,7 @@ def provenance(agent=None, seconds: float | None = None, **config) -> dict:
 
     record = {"config": config, "scale": scale(), **checkpoints.provenance()}
     if agent is not None:
+        checkpoints.require_agent(agent)
         record["agent"] = {
             "name": agent.name,
             "hash": agent.hash,
@@ -103,7 +119,7 @@ def provenance(agent=None, seconds: float | None = None, **config) -> dict:
             "steps": agent.metadata.get("steps"),
         }
     if seconds is not None:
-        record["seconds"] = round(seconds, 1)
+        record["seconds"] = round(require_number("seconds", seconds, 0), 1)
     return record
 
 
@@ -123,6 +139,7 @@ def result(name: str, compute: Callable[[], list[dict]], agent=None, recompute=F
     Returns:
         {"records": [...], "provenance": {...}}.
     """
+    require_function("compute", compute)
     return result_in_parts(name, {"all": compute}, agent, recompute, **config)
 
 
@@ -158,7 +175,13 @@ def result_in_parts(
         OSError: if the file cannot be written; the old one stays.
     """
     path, kept = result_path(name), scale() != "smoke"
-    settings = settings or {}
+    for label, value in (("recompute", recompute), ("progress", progress)):
+        require_flag(label, value)
+    for part, compute in _require_parts("parts", parts).items():
+        require_function(f"parts[{part!r}]", compute)
+    settings = {} if settings is None else _require_parts("settings", settings)
+    _require_agent(agent)
+    _require_json("config", config)
     known, _ = _usable_parts(path, agent, config, settings, recompute) if kept else ({}, False)
     if recompute or parts.keys() - known.keys():
         provenance()  # reads the commit of the code that is about to run
@@ -190,7 +213,7 @@ def stored_result(path) -> dict:
     Raises FileNotFoundError if it is missing, ValueError if it is damaged.
     """
     fix = "restore it, or delete it and compute it anew"
-    parts = _read_parts(Path(path), fix)
+    parts = _read_parts(require_path("path", path), fix)
     if not parts:
         raise ValueError(f"{path} holds no parts; {fix}")
     return _joined(list(parts.values()))
@@ -232,9 +255,13 @@ def _write_parts(path: Path, parts: dict, another: bool) -> None:
 
 def stored_parts(name: str, agent=None, settings=None, **config) -> list[str]:
     """Names of the parts that `result_in_parts` would load for these arguments."""
+    path, settings = result_path(name), {} if settings is None else settings
+    _require_parts("settings", settings)
+    _require_agent(agent)
+    _require_json("config", config)
     if scale() == "smoke":
         return []
-    return list(_usable_parts(result_path(name), agent, config, settings or {}, False)[0])
+    return list(_usable_parts(path, agent, config, settings, False)[0])
 
 
 def stored_config(name: str, agent=None) -> dict | None:
@@ -243,6 +270,7 @@ def stored_config(name: str, agent=None) -> dict | None:
     A damaged file has none: whoever wants its records is told.
     """
     path = result_path(name)
+    _require_agent(agent)
     if scale() == "smoke" or not path.exists():
         return None
     try:
@@ -256,8 +284,37 @@ def stored_config(name: str, agent=None) -> dict | None:
 def result_path(name: str) -> Path:
     """Where `result` keeps that experiment at the scale in force."""
     suffix = "" if scale() == "reduced" else f"_{scale()}"
-    name = require_folder_name("the name of the result", name)
+    require_name("name", name)
     return data_dir() / "results" / f"{name}{suffix}.json"
+
+
+def _require_agent(agent) -> None:
+    """TypeError if an agent that may be None is something else."""
+    if agent is not None:
+        from shapebody.checkpoints import require_agent
+
+        require_agent(agent)
+
+
+def _require_parts(name: str, parts) -> dict:
+    """The dictionary; TypeError if it is none, or if its keys are no texts."""
+    require_kind(name, parts, dict, "by name of the part")
+    for part in parts:
+        require_kind(f"a key of {name}", part, str, "the name of a part")
+    if name == "parts" and not parts:
+        raise ValueError("parts is {}; expected at least one part")
+    return parts
+
+
+def _require_json(name: str, value) -> None:
+    """ValueError if a value cannot be written as JSON."""
+    try:
+        json.dumps(value)
+    except (TypeError, ValueError) as error:
+        raise ValueError(
+            f"{name} is {shown(value)}, which JSON cannot hold ({error}); expected numbers, texts, "
+            "lists and dictionaries"
+        ) from error
 
 
 def _usable_parts(path, agent, config, settings: dict, overwrite: bool) -> tuple[dict, bool]:
@@ -299,7 +356,7 @@ def _read_parts(path: Path, fix: str) -> dict:
 
     def require(sound: bool, what: str, value, expected: str):
         if not sound:
-            raise ValueError(f"{what} is {shortened(value)}, expected {expected}")
+            raise ValueError(f"{what} is {shown(value)}, expected {expected}")
 
     def listed(value, kind):
         return isinstance(value, list) and all(isinstance(x, kind) for x in value)
@@ -352,6 +409,8 @@ def _one_record_per_line(parts: dict) -> str:
 
 def verdict(low: float, high: float) -> str:
     """What an interval of a difference allows to say about its sign."""
+    if require_number("low", low) > require_number("high", high):
+        raise ValueError(f"low is {low} and high is {high}; expected low <= high")
     if low > 0:
         return "positive: the whole interval is above zero"
     if high < 0:
@@ -366,7 +425,9 @@ def rank_correlation(x, y, resamples: int = 2000, seed: int = 0) -> tuple[float,
     """
     from scipy.stats import rankdata
 
-    x, y = np.asarray(x, float), np.asarray(y, float)
+    x, y = require_array("x", x).astype(float), require_array("y", y).astype(float)
+    require_integer("resamples", resamples, 1, 1_000_000)
+    require_seed("seed", seed)
     if x.shape != y.shape or x.ndim != 1 or len(x) < 3:
         raise ValueError(f"x {x.shape} and y {y.shape}: expected two lists of three or more pairs")
 
@@ -422,6 +483,9 @@ def derived_constants(
     from shapebody.locomotion import TaskConfig
 
     space = DesignSpace(robot)
+    require_integer("starts", starts, 0, 100_000)
+    # A standard error needs two.
+    require_integer("episodes", episodes, 2, 1_000_000)
     designs = np.stack([space.reference] + [space.start(i) for i in range(starts)])
     kept, recomputed = (
         evaluate(
@@ -461,6 +525,7 @@ def before_after(agent, robot, path, start: int = 3, trust_region: float = 100.0
     from shapebody.design import DesignSpace
     from shapebody.search import search
 
+    path = require_output("path", path)
     space = DesignSpace(robot)
     f = space.start(start)
     found = search("vgds", agent, robot, f, trust_region=trust_region).design
@@ -471,4 +536,6 @@ def before_after(agent, robot, path, start: int = 3, trust_region: float = 100.0
     source.add_text(
         "provenance", json.dumps(provenance(agent, start=start, trust_region=trust_region))
     )
-    Image.fromarray(picture).save(path, pnginfo=source)
+    buffer = io.BytesIO()
+    Image.fromarray(picture).save(buffer, format="PNG", pnginfo=source)
+    atomic_write(path, buffer.getvalue())

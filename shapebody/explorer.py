@@ -17,6 +17,16 @@ import mujoco
 import numpy as np
 
 from shapebody import drawing, video
+from shapebody.checks import (
+    refuse,
+    require_array,
+    require_flag,
+    require_integer,
+    require_kind,
+    require_list,
+    require_number,
+)
+from shapebody.design import DesignSpace
 from shapebody.files import atomic_write
 
 _ROOT = "/robot"
@@ -31,6 +41,11 @@ class Scene:
     """Commands of MeshCat's viewer, as JSON-able dicts."""
     height: int = 420
     """Height in the notebook, in pixels."""
+
+    def __post_init__(self):
+        for command in require_list("commands", self.commands):
+            require_kind("a command", command, dict, "of MeshCat's viewer")
+        require_integer("height", self.height, 16, 8192)
 
     def static_html(self) -> str:
         """The whole page as text."""
@@ -107,8 +122,9 @@ def show_design(robot_or_space, f=None, qpos=None, spheres: bool = False, height
     qpos: [nq], the standing pose if None. spheres: also show the collision spheres.
     """
     model = _model(robot_or_space, f)
-    parts = _parts(model, spheres)
-    pose = video.standing_pose(model) if qpos is None else np.asarray(qpos, float)
+    require_integer("height", height, 16, 8192)
+    parts = _parts(model, require_flag("spheres", spheres))
+    pose = video.standing_pose(model) if qpos is None else video._check_qpos(model, qpos, 1)
     commands = [_add(part) for part in parts]
     commands += [_place(part, transform) for part, transform in _transforms(parts, model, pose)]
     return Scene([*_surroundings(model, pose), *commands], height)
@@ -119,12 +135,17 @@ def animate_designs(space, trajectory, seconds: float = 4.0, frames: int = 60, h
 
     At most `frames` of the n designs are used, evenly spread, the first and the last included.
     """
-    trajectory = np.asarray(trajectory, np.float32)
+    _require_space(space)
+    require_number("seconds", seconds, 0.01, 3600)
+    require_integer("frames", frames, 2, 10_000)
+    require_integer("height", height, 16, 8192)
+    trajectory = require_array("trajectory", trajectory).astype(np.float32)
     if trajectory.ndim != 2 or trajectory.shape[1] != space.dim or len(trajectory) < 2:
         raise ValueError(
             f"trajectory has shape {list(trajectory.shape)}, expected [n >= 2, {space.dim}]; "
             "give the designs of one start"
         )
+    space.validate(trajectory)
     rows = np.unique(np.linspace(0, len(trajectory) - 1, frames).round().astype(int))
     models = [space.to_model(f) for f in trajectory[rows]]
     poses = [video.standing_pose(model) for model in models]
@@ -165,6 +186,7 @@ class LiveScene:
     """
 
     def __init__(self, space):
+        _require_space(space)
         import meshcat
 
         self.space = space
@@ -224,12 +246,20 @@ _UNIT_SHAPES = {
 _Y_TO_Z = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])
 
 
+def _require_space(space) -> None:
+    require_kind("space", space, DesignSpace, "shapebody.DesignSpace(robot)")
+
+
 def _model(robot_or_space, f):
-    if hasattr(robot_or_space, "to_model"):
+    if isinstance(robot_or_space, DesignSpace):
         return robot_or_space.to_model(robot_or_space.reference if f is None else f)
     if f is not None:
         raise ValueError("a design f needs a DesignSpace: show_design(DesignSpace(robot), f)")
-    return video._model_of(robot_or_space)
+    model = getattr(robot_or_space, "model", robot_or_space)
+    if not isinstance(model, mujoco.MjModel):
+        expected = "a Robot, a DesignSpace or a mujoco.MjModel"
+        raise refuse("robot_or_space", robot_or_space, expected, kind=TypeError)
+    return model
 
 
 def _parts(model, spheres):

@@ -22,16 +22,25 @@ import jax.numpy as jnp
 import numpy as np
 import safetensors.numpy
 
+from shapebody.checks import (
+    names_the_file,
+    require_folder,
+    require_kind,
+    require_output,
+    require_path,
+)
 from shapebody.stored import read_metadata, read_safetensors, read_text
 
 
+@names_the_file
 def atomic_write(path: str | Path, data: bytes | str) -> Path:
     """Write a file so that it is never seen half-written; its folder is created if needed.
 
     What killed calls for the same path left behind is removed. Raises OSError, which names the
     path, if the disk is full or the folder cannot be written; the old file is then as it was.
     """
-    path = Path(path)
+    path = require_output("path", path)
+    require_kind("data", data, bytes | str, "a text or bytes")
     with names_path(path):
         path.parent.mkdir(parents=True, exist_ok=True)
         _remove_leftovers(path)
@@ -239,7 +248,7 @@ def alone_in(folder: str | Path):
     Raises:
         ValueError: if the folder is taken.
     """
-    handle = os.open(folder, os.O_RDONLY)
+    handle = os.open(require_folder("folder", folder), os.O_RDONLY)
     try:
         try:
             fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
@@ -259,7 +268,7 @@ def read_curve(path: str | Path) -> dict[str, np.ndarray]:
     Raises FileNotFoundError if it is missing, ValueError if it is damaged: no rows, rows of another
     length than the first, or text where a number should be.
     """
-    path = Path(path)
+    path = require_path("path", path)
     fix = "restore it, or save the agent anew with Trainer.save_agent"
     text = read_text(path, fix)
     try:
@@ -307,7 +316,7 @@ def load_arrays(path: str | Path, like):
         ValueError: if the file is cut off, or its names, shapes or types differ from those of
             `like`.
     """
-    path = Path(path)
+    path = require_path("path", path)
     fix = "delete it to start anew, or use the configuration it was written with"
     expected = dict(_leaves(like, shapes_only=True))
 

@@ -18,11 +18,11 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 
-from shapebody.checkpoints import Agent, require_agent
-from shapebody.checks import require_integer
+from shapebody.checkpoints import Agent
+from shapebody.checks import require_engine, require_flag, require_integer, require_kind
 from shapebody.locomotion import Locomotion
 from shapebody.networks import Policy
-from shapebody.ppo import Failures, TrainConfig, Trainer, _apply
+from shapebody.ppo import MOST_STEPS, Failures, TrainConfig, Trainer, _apply
 from shapebody.stored import plain as _plain
 
 NOISE = 0.1
@@ -64,8 +64,11 @@ def begin_run(
         ValueError: if there is a run in the folder, another one begins there, or the teacher is
             not for these robots; if the simulation of a robot always fails.
     """
-    require_agent(teacher)
-    require_integer("steps", steps, 1)
+    require_kind("config", config, TrainConfig, "such as TrainConfig.reduced(...)")
+    require_kind("teacher", teacher, Agent, "load it with shapebody.load_agent(...)")
+    require_integer("steps", steps, 1, MOST_STEPS)
+    require_engine("engine", engine)
+    require_flag("progress", progress)
     trainer = Trainer(config, folder, engine)
     names = {robot.name for robot in trainer.env.robots}
     if names != set(teacher.robots):

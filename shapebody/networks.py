@@ -21,6 +21,7 @@ broadcast against each other: descriptions [B, 1, ...] with observations [B, T, 
 B times only. Joints and feet whose mask is 0 have no influence on anything.
 """
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from types import SimpleNamespace
 from typing import Any
@@ -30,6 +31,18 @@ import jax.numpy as jnp
 import numpy as np
 from flax import linen as nn
 
+from shapebody.checks import (
+    refuse,
+    require_array,
+    require_choice,
+    require_integer,
+    require_key,
+    require_kind,
+    require_list,
+    require_number,
+    require_shape,
+)
+
 JOINT_DESCRIPTION = 30
 FOOT_DESCRIPTION = 21
 STATIC = 14
@@ -37,6 +50,9 @@ JOINT_OBSERVATION = 4
 FOOT_OBSERVATION = 3
 GENERAL = 13
 PRIVILEGED = 5
+
+WIDEST, MOST_LAYERS = 65_536, 100
+"""Largest width of a layer, and largest number of layers."""
 
 INPUT_SIZES = {
     "joint_descriptions": JOINT_DESCRIPTION,
@@ -91,18 +107,18 @@ class PolicyConfig:
 
     def __post_init__(self):
         _set_widths(self, "key_widths", "core_widths")
-        object.__setattr__(self, "std_limits", tuple(float(x) for x in self.std_limits))
         _check_encoder(self, "value_latent")
+        limits = require_array("std_limits", self.std_limits, (2,)).astype(float)
+        object.__setattr__(self, "std_limits", tuple(limits.tolist()))
+        require_number("initial_std", self.initial_std, above=0)
+        require_number("mean_limit", self.mean_limit, above=0)
         if self.core_widths[-1] != self.key_widths[-1]:
             raise ValueError(
                 f"core_widths ends with {self.core_widths[-1]} and key_widths with "
                 f"{self.key_widths[-1]}; make the last widths equal, an action mean is their dot "
                 "product"
             )
-        if self.log_std_input not in ("tanh", "softmax"):
-            raise ValueError(
-                f"log_std_input is {self.log_std_input!r}; expected 'tanh' or 'softmax'"
-            )
+        require_choice("log_std_input", self.log_std_input, ("tanh", "softmax"))
         if not 0 < self.std_limits[0] <= self.initial_std <= self.std_limits[1]:
             raise ValueError(
                 f"initial_std is {self.initial_std}; choose it inside std_limits {self.std_limits}"
@@ -153,8 +169,7 @@ class CriticConfig:
     def __post_init__(self):
         _set_widths(self, "joint_key_widths", "foot_key_widths", "head_widths")
         _check_encoder(self, "joint_value_latent", "foot_value_latent", "heads")
-        if self.kind not in ("direct-design", "original"):
-            raise ValueError(f"kind is {self.kind!r}; expected 'direct-design' or 'original'")
+        require_choice("kind", self.kind, ("direct-design", "original"))
 
     @classmethod
     def original(cls, **changes) -> "CriticConfig":
@@ -187,16 +202,18 @@ class CriticConfig:
 def _set_widths(config, *names):
     """Turn the named fields into tuples of int, so that a config read from JSON stays hashable."""
     for name in names:
-        widths = tuple(int(width) for width in getattr(config, name))
-        if not widths or min(widths) < 1:
+        widths = require_list(name, getattr(config, name), MOST_LAYERS)
+        widths = tuple(require_integer(f"a width in {name}", x, 1, WIDEST) for x in widths)
+        if not widths:
             raise ValueError(f"{name} is {widths}; expected at least one width, all positive")
         object.__setattr__(config, name, widths)
 
 
 def _check_encoder(config, *positive):
     for name in positive:
-        if getattr(config, name) < 1:
-            raise ValueError(f"{name} is {getattr(config, name)}; expected at least 1")
+        require_integer(name, getattr(config, name), 1, WIDEST)
+    for name in ("initial_temperature", "minimum_temperature", "latent_scale"):
+        require_number(name, getattr(config, name))
     if not 0 <= config.minimum_temperature < config.initial_temperature:
         raise ValueError(
             f"initial_temperature is {config.initial_temperature}; choose it above "
@@ -308,6 +325,43 @@ class Core(nn.Module):
         return x
 
 
+DESCRIPTION_PARTS = {"joints": JOINT_DESCRIPTION, "feet": FOOT_DESCRIPTION, "static": STATIC}
+OBSERVATION_PARTS = {
+    "joints": JOINT_OBSERVATION,
+    "feet": FOOT_OBSERVATION,
+    "general": GENERAL,
+    "privileged": PRIVILEGED,
+}
+
+
+def require_inputs(descriptions, observation, of_policy: bool = False) -> None:
+    """TypeError if a network's inputs lack what is read of them; ValueError for wrong columns.
+
+    of_policy: feet and privileged observations may be absent. Costs nothing in compiled code.
+    """
+    unread = ("feet", "privileged") if of_policy else ()
+    for argument, value, parts, hint in (
+        ("descriptions", descriptions, DESCRIPTION_PARTS, "describe(robot)(space(f))"),
+        ("observation", observation, OBSERVATION_PARTS, "such as the states of an agent"),
+    ):
+        _require_parts(argument, value, {k: v for k, v in parts.items() if k not in unread}, hint)
+    for name in ("joints",) if of_policy else ("joints", "feet"):
+        count, other = (getattr(x, name).shape[-2] for x in (descriptions, observation))
+        if count != other:
+            raise ValueError(
+                f"descriptions are of {count} {name} and observation is of {other}; expected the "
+                "same robot and padding (`sizes`) in both"
+            )
+
+
+def _require_parts(argument, value, parts, hint) -> None:
+    for name, columns in parts.items():
+        if not hasattr(value, name):
+            raise refuse(argument, value, f"an object with {name}", hint, TypeError)
+        leading = ("...",) if name in ("static", "general", "privileged") else ("...", "n")
+        require_shape(f"{argument}.{name}", getattr(value, name), (*leading, columns))
+
+
 class _Standardized(nn.Module):
     """Declares the input constants (collection "constants", identity unless given)."""
 
@@ -338,6 +392,10 @@ class Policy(_Standardized):
     """
 
     config: PolicyConfig = PolicyConfig()
+
+    def __post_init__(self):
+        require_kind("config", self.config, PolicyConfig, "shapebody.PolicyConfig(...)")
+        super().__post_init__()
 
     def setup(self):
         config = self.config
@@ -389,6 +447,7 @@ class Policy(_Standardized):
         return mean * mask, jnp.where(mask > 0, std, 1.0)
 
     def __call__(self, descriptions, observation):
+        require_inputs(descriptions, observation, of_policy=True)
         return self.act(self.embed(descriptions), descriptions, observation)
 
 
@@ -400,6 +459,10 @@ class Critic(_Standardized):
     """
 
     config: CriticConfig = CriticConfig()
+
+    def __post_init__(self):
+        require_kind("config", self.config, CriticConfig, "shapebody.CriticConfig(...)")
+        super().__post_init__()
 
     def setup(self):
         config = self.config
@@ -464,6 +527,7 @@ class Critic(_Standardized):
         return self.value(embedding, descriptions, observation)
 
     def __call__(self, descriptions, observation):
+        require_inputs(descriptions, observation)
         return self.value(self.embed(descriptions), descriptions, observation)
 
 
@@ -483,6 +547,10 @@ def initialize(network, key, constants=None) -> dict:
         key: PRNG key.
         constants: input constants from `standardization`; the identity if not given.
     """
+    require_kind("network", network, nn.Module, "shapebody.Policy(...) or shapebody.Critic(...)")
+    require_key("key", key)
+    if constants is not None:
+        _require_constants(constants)
     descriptions = SimpleNamespace(
         joints=jnp.zeros((1, JOINT_DESCRIPTION)),
         joint_mask=jnp.ones(1),
@@ -502,6 +570,17 @@ def initialize(network, key, constants=None) -> dict:
         return dict(variables)
     used = {name: constants[name] for name in variables["constants"]}
     return {"params": variables["params"], "constants": used}
+
+
+def _require_constants(constants) -> None:
+    """TypeError or ValueError if input constants are not as `standardization` returns them."""
+    require_kind("constants", constants, Mapping, "what networks.standardization returns")
+    for name, size in INPUT_SIZES.items():
+        one = constants.get(name)
+        if not isinstance(one, Mapping) or one.keys() != {"mean", "scale"}:
+            raise refuse(f"constants[{name!r}]", one, 'a dictionary of "mean" and "scale"')
+        for part in ("mean", "scale"):
+            require_shape(f"constants[{name!r}][{part!r}]", one[part], (size,))
 
 
 # Typical size of an observation in the units of the environment: 0.5 rad and 5 rad/s of a joint,
@@ -536,6 +615,11 @@ def standardization(*descriptions, floor=1e-3, constant=1e-6) -> dict:
     """
     if not descriptions:
         raise ValueError("standardization got no descriptions; give at least one batch of them")
+    require_number("floor", floor, above=0)
+    require_number("constant", constant, 0)
+    for batch in descriptions:
+        hint = "describe(robot)(space(designs))"
+        _require_parts("descriptions", batch, DESCRIPTION_PARTS, hint)
 
     def rows(name, mask=None):
         tables = []
@@ -566,7 +650,10 @@ def standardization(*descriptions, floor=1e-3, constant=1e-6) -> dict:
 
 def count_parameters(params) -> int:
     """Number of learned scalars in a params collection (constants do not belong to it)."""
-    return sum(int(np.prod(leaf.shape)) for leaf in jax.tree.leaves(params))
+    leaves = jax.tree.leaves(params)
+    if not leaves or not all(hasattr(leaf, "shape") for leaf in leaves):
+        raise refuse("params", params, 'a pytree of arrays, such as agent.policy["params"]')
+    return sum(int(np.prod(leaf.shape)) for leaf in leaves)
 
 
 def log_prob(mean, std, action, mask):

@@ -7,6 +7,7 @@ from run to run by itself (times, versions of the kernel, widget states).
 """
 
 import argparse
+import os
 import re
 import sys
 import tempfile
@@ -15,6 +16,7 @@ from pathlib import Path
 
 import nbformat
 
+from shapebody.checks import require_file, require_kind, require_number
 from shapebody.files import atomic_write
 
 LONGEST_CELL = 30
@@ -35,8 +37,10 @@ def execute(path: str | Path, timeout: float | None = None) -> float:
     """
     from nbclient import NotebookClient
 
-    path = Path(path)
-    notebook = nbformat.read(path, as_version=4)
+    path = require_file("path", path)
+    if timeout is not None:
+        require_number("timeout", timeout, above=0)
+    notebook = _read(path)
     for cell in _code(notebook):
         cell.outputs, cell.execution_count = [], None
     client = NotebookClient(
@@ -55,8 +59,19 @@ def execute(path: str | Path, timeout: float | None = None) -> float:
     return seconds
 
 
+def _read(path: Path):
+    """A notebook; ValueError for a file that is none."""
+    try:
+        notebook = nbformat.read(path, as_version=4)
+        nbformat.validate(notebook)
+    except Exception as error:  # of nbformat, jsonschema, json, and what they do not catch
+        raise ValueError(f"{path} is no notebook ({type(error).__name__})") from error
+    return notebook
+
+
 def normalise(notebook) -> None:
     """Remove, in place, what differs between two runs with the same results."""
+    require_kind("notebook", notebook, nbformat.NotebookNode, "from nbformat.read")
     notebook.metadata = nbformat.from_dict(
         {"kernelspec": _KERNEL, "language_info": {"name": "python"}}
     )
@@ -88,9 +103,9 @@ def _last_of_rewritten_lines(text):
 
 def problems(path: str | Path) -> list[str]:
     """What keeps a notebook from being shipped, one sentence each; empty if nothing."""
-    path = Path(path)
+    path = require_file("path", path)
     text = path.read_text(encoding="utf-8")
-    notebook = nbformat.reads(text, as_version=4)
+    notebook = _read(path)
     code = [cell for cell in _code(notebook) if cell.source.strip()]
     counts = [cell.execution_count for cell in code]
     found = []
@@ -112,8 +127,8 @@ def problems(path: str | Path) -> list[str]:
             found.append(f"an output of code cell {number} holds a memory address")
     if len(text.encode()) > LARGEST_FILE:
         found.append(f"{len(text.encode()) / 1e6:.1f} MB, at most {LARGEST_FILE / 1e6:.1f}")
-    folders = {str(Path.home()), str(Path.cwd()), tempfile.gettempdir(), "/home", "/Users"}
-    for folder in sorted(folders - {"/"}):
+    folders = {os.path.expanduser("~"), str(Path.cwd()), tempfile.gettempdir(), "/home", "/Users"}
+    for folder in sorted(folders - {"/", "~"}):
         if re.search(re.escape(folder) + r"/\w", text):
             found.append(f"a path of one machine, {folder}/..., is in its text or outputs")
     return found
@@ -123,11 +138,17 @@ def _code(notebook):
     return [cell for cell in notebook.cells if cell.cell_type == "code"]
 
 
-def main(arguments=None) -> int:
+def parser() -> argparse.ArgumentParser:
+    """The options of the command."""
     parser = argparse.ArgumentParser(prog="python -m shapebody.notebooks", description=__doc__)
     parser.add_argument("notebook", nargs="*", type=Path)
     parser.add_argument("--check", action="store_true", help="only check, execute nothing")
-    options = parser.parse_args(arguments)
+    return parser
+
+
+def main(arguments=None) -> int:
+    """Execute and check notebooks; returns the exit status."""
+    options = parser().parse_args(arguments)
     failed = 0
     for path in options.notebook:
         if not options.check:
@@ -138,7 +159,10 @@ def main(arguments=None) -> int:
                 print(f"{path} failed and was left as it was:\n{error}", file=sys.stderr)
                 failed += 1
                 continue
-        found = problems(path)
+        try:
+            found = problems(path)
+        except (ValueError, OSError) as error:
+            found = [str(error)]
         for problem in found:
             print(f"{path}: {problem}")
         failed += bool(found)

@@ -6,6 +6,8 @@ read off its figures by eye, each to about ±`READING_ERROR`. ΔR is R(f*) - R(f
 ten starts; returns are undiscounted sums over an episode.
 """
 
+from shapebody.checks import require_number, require_text
+
 ROBOTS = ("unitree_go2", "mit_humanoid", "golem")
 """The robots of the single-robot experiments, by their names in data/robots."""
 
@@ -227,6 +229,8 @@ GOLEM_CONTROL_SHIFT = {"action_scale": -12.2, "p_gain": -4.1, "d_gain": 4.4}
 
 def trust_region_gain(robot: str, trust_region: float) -> float | None:
     """The paper's ΔR of VGDS for a robot at a penalty coefficient λ; None where it has none."""
+    require_text("robot", robot)
+    require_number("trust_region", trust_region, 0)
     if robot not in TRUST_REGION or trust_region not in LAMBDAS:
         return None
     return TRUST_REGION[robot][LAMBDAS.index(trust_region)]

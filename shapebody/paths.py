@@ -3,6 +3,8 @@
 import os
 from pathlib import Path
 
+from shapebody.checks import require_path
+
 
 def data_dir() -> Path:
     """Folder with robots, checkpoints and results.
@@ -11,7 +13,8 @@ def data_dir() -> Path:
     Raises FileNotFoundError if that folder does not exist.
     """
     override = os.environ.get("SHAPEBODY_DATA")
-    folder = Path(override) if override else Path(__file__).resolve().parent.parent / "data"
+    shipped = Path(__file__).resolve().parent.parent / "data"
+    folder = require_path("SHAPEBODY_DATA", override) if override else shipped
     if not folder.is_dir():
         raise FileNotFoundError(
             f"data folder {str(folder)!r} does not exist: set SHAPEBODY_DATA to the 'data' folder "

@@ -9,6 +9,15 @@ import matplotlib as mpl
 import matplotlib.pyplot as plt
 import numpy as np
 
+from shapebody.checks import (
+    refuse,
+    require_array,
+    require_integer,
+    require_kind,
+    require_list,
+    require_text,
+    shown,
+)
 from shapebody.files import read_curve
 
 # Okabe and Ito's colours stay distinct for colour-blind readers.
@@ -52,16 +61,25 @@ def use_style() -> None:
     )
 
 
+def _axes(ax):
+    """Axes to draw into, or None; TypeError for anything else."""
+    if ax is not None:
+        require_kind("ax", ax, mpl.axes.Axes, "from plt.subplots()")
+    return ax
+
+
 def learning_curve(path: str | Path, y: str, x: str = "steps", ax=None, smooth: int = 1, **style):
     """Plot column `y` of a learning curve over column `x`; returns the axes.
 
     smooth: number of records averaged; above 1, the raw values are shown faintly behind.
     Raises ValueError for a column that the file does not have.
     """
+    require_integer("smooth", smooth, 1, 1_000_000)
+    ax = _axes(ax)
     columns = read_curve(path)
     for name in (x, y):
-        if name not in columns:
-            raise ValueError(f"{path} has no column {name!r}; it has {', '.join(columns)}")
+        if not isinstance(name, str) or name not in columns:
+            raise ValueError(f"{path} has no column {shown(name)}; it has {', '.join(columns)}")
     ax = ax or plt.gca()
     values = columns[y]
     if smooth > 1:
@@ -83,8 +101,17 @@ def intervals(labels: Sequence[str], values: Sequence, colours: Sequence = (), a
 
     values: (mean, low, high) per label, or None for an empty row; colours: one per label, if any.
     """
-    ax = ax or plt.gca()
-    for place, value in enumerate(values):
+    labels = [require_text("a label", label) for label in require_list("labels", labels)]
+    values, colours = require_list("values", values), require_list("colours", colours)
+    for name, given in (("values", values), ("colours", colours)):
+        if len(given) != len(labels) and (given or name == "values"):
+            raise ValueError(f"{len(given)} {name} for {len(labels)} labels; give one each")
+    for colour in colours:
+        if not mpl.colors.is_color_like(colour):
+            raise refuse("a colour", colour, "one that Matplotlib knows, such as '#0072B2'")
+    rows = [None if row is None else require_array("a value", row, (3,)) for row in values]
+    ax = _axes(ax) or plt.gca()
+    for place, value in enumerate(rows):
         if value is not None:
             mean, low, high = value
             colour = colours[place] if len(colours) else COLOURS["blue"]
@@ -101,6 +128,16 @@ class Table:
     header: tuple[str, ...]
     rows: tuple[tuple[str, ...], ...]
     caption: str = ""
+
+    def __post_init__(self):
+        rows = require_list("rows", self.rows)
+        for name, row in (("header", self.header), *(("a row", row) for row in rows)):
+            require_kind(name, row, tuple, "of texts, see plots.table")
+            for cell in row:
+                require_text(f"a cell of {name}", cell, 10_000)
+            if len(row) != len(self.header):
+                raise ValueError(f"{name} has {len(row)} cells; expected {len(self.header)}")
+        require_text("caption", self.caption, 10_000)
 
     def markdown(self) -> str:
         rule = ["---"] + ["---:"] * (len(self.header) - 1)
@@ -139,7 +176,12 @@ class Table:
 
 def table(rows: Iterable[Sequence], header: Sequence[str], digits: int = 2, caption: str = ""):
     """Table of values. A number gets `digits` decimals, a pair (m, h) becomes "m ± h", None "–"."""
-    header = tuple(str(cell) for cell in header)
+    header = tuple(str(cell) for cell in require_list("header", header, 1000))
+    if not header:
+        raise ValueError("header is empty; expected the title of at least one column")
+    require_integer("digits", digits, 0, 17)
+    require_text("caption", caption, 10_000)
+    rows = [require_list("a row", row) for row in require_list("rows", rows, 100_000)]
     rows = tuple(tuple(_text(cell, digits) for cell in row) for row in rows)
     for row in rows:
         if len(row) != len(header):
@@ -152,15 +194,16 @@ def paper_table(rows: Iterable[Sequence], digits: int = 2, caption: str = "", no
 
     Values as in `table`. note: header of our column, best with scale and engine.
     """
+    require_text("note", note)
     return table(rows, ("", "paper", note), digits, caption)
 
 
 def agents_table(agents: Iterable):
     """Table of agents that are compared: their training, and that of the critic they bring."""
-    from shapebody.checkpoints import load_curve
+    from shapebody.checkpoints import load_curve, require_agent
 
     rows = []
-    for agent in agents:
+    for agent in [require_agent(agent) for agent in require_list("agents", agents, 10_000)]:
         rows.append(
             (
                 agent.name,
@@ -193,4 +236,9 @@ def _text(value, digits) -> str:
         return "yes" if value else "no"
     if isinstance(value, int | np.integer):
         return f"{value:,}"
-    return f"{float(value):.{digits}f}" if np.isfinite(value) else "–"
+    try:
+        number = float(value)
+    except (TypeError, ValueError, OverflowError) as error:
+        expected = "a number, a text, a pair (mean, half width) or None"
+        raise refuse("a cell", value, expected) from error
+    return f"{number:.{digits}f}" if np.isfinite(number) else "–"

@@ -23,6 +23,7 @@ import secrets
 import shutil
 import sys
 import time
+from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -36,13 +37,29 @@ import optax
 from shapebody.checkpoints import (
     Agent,
     atomic_write,
+    chosen_folder,
     load_agent,
     load_arrays,
     read_metadata,
+    require_agent,
     save_agent,
     save_arrays,
 )
-from shapebody.checks import require_integer, require_kind
+from shapebody.checks import (
+    refuse,
+    require_choice,
+    require_engine,
+    require_flag,
+    require_integer,
+    require_kind,
+    require_list,
+    require_name,
+    require_number,
+    require_path,
+    require_seed,
+    require_shape,
+    shown,
+)
 from shapebody.files import alone_in, names_path
 from shapebody.locomotion import Locomotion, TaskConfig, Trajectory
 from shapebody.locomotion.observations import COMMAND, Observation
@@ -64,12 +81,12 @@ from shapebody.stored import (
     read_json,
     read_number,
     read_text,
-    require_folder_name,
-    shortened,
 )
 from shapebody.stored import from_plain as _from_plain
 from shapebody.stored import plain as _plain
 
+MOST_STEPS = 10**15
+"""Largest number of environment steps."""
 SCALES = ("smoke", "reduced", "full")
 """Names of the sizes at which everything can be computed."""
 
@@ -124,7 +141,8 @@ class TrainConfig:
     """States kept for design search."""
 
     def __post_init__(self):
-        robots = (self.robots,) if isinstance(self.robots, str | Path) else tuple(self.robots)
+        single = isinstance(self.robots, str | Path)
+        robots = (self.robots,) if single else tuple(require_list("robots", self.robots, 1000))
         names = [_robot_name(robot) for robot in robots]
         robots = tuple(str(robot) for robot in robots)
         object.__setattr__(self, "robots", robots)
@@ -135,46 +153,38 @@ class TrainConfig:
                 f"robots is {robots!r}; expected robots of different names: a robot is known by "
                 "the name of its file, so leave out repeated ones, or copy a file to another name"
             )
-        require_folder_name("name", self.name)
+        require_name("name", self.name)
         counts = ("num_envs", "rollout_length", "total_steps", "minibatch_size", "epochs")
         for name in (*counts, "state_bank"):
             value = getattr(self, name)
-            object.__setattr__(self, name, require_integer(name, value, 1))
+            most = MOST_STEPS if name == "total_steps" else 2**24
+            object.__setattr__(self, name, require_integer(name, value, 1, most))
         for name in ("discount", "gae_lambda", "value_lambda"):
-            value = getattr(self, name)
-            if not _is_number(value, 1) and (name, value) != ("value_lambda", None):
-                raise ValueError(f"{name} is {value!r}; expected a number from 0 to 1")
-        object.__setattr__(self, "seed", require_integer("seed", self.seed))
+            if name != "value_lambda" or self.value_lambda is not None:
+                require_number(name, getattr(self, name), 0, 1)
+        object.__setattr__(self, "seed", require_seed("seed", self.seed))
         for name, kind in (("policy", PolicyConfig), ("critic", CriticConfig)):
             hint = f"shapebody.{kind.__name__}.reduced(...)"
             require_kind(name, getattr(self, name), kind, hint)
         require_kind("task", self.task, TaskConfig, "shapebody.TaskConfig(...)")
         for name in ("standardize", "cut_at_commands", "learn_policy", "mean_actions"):
-            require_kind(name, getattr(self, name), bool, "True or False")
+            require_flag(name, getattr(self, name))
         if self.learn_policy and self.mean_actions:
             raise ValueError(
                 "mean_actions is True, but a policy learns from its exploration; expected "
                 "learn_policy=False with it"
             )
-        if self.scale not in SCALES:
-            raise ValueError(f"scale is {self.scale!r}; expected one of {', '.join(SCALES)}")
-        if not _is_number(self.entropy_coefficient, math.inf):
-            raise ValueError(
-                f"entropy_coefficient is {self.entropy_coefficient!r}; expected a number of at "
-                "least 0"
-            )
+        require_choice("scale", self.scale, SCALES)
+        require_number("entropy_coefficient", self.entropy_coefficient, 0)
         for name in ("clip_range", "max_gradient_norm", "kl_threshold"):
             value = getattr(self, name)
-            endless = name == "kl_threshold" and value == math.inf
-            if not endless and not (_is_number(value, math.inf) and value > 0):
-                raise ValueError(f"{name} is {value!r}; expected a positive number")
+            if not (name == "kl_threshold" and isinstance(value, float) and value == math.inf):
+                require_number(name, value, above=0)
         rates = self.learning_rate
-        rates = tuple(rates) if isinstance(rates, tuple | list) else ()
-        if len(rates) != 2 or not all(_is_number(rate, math.inf) for rate in rates):
-            raise ValueError(
-                f"learning_rate is {self.learning_rate!r}; expected two numbers of at least 0, "
-                "for the first and for the last step"
-            )
+        if not isinstance(rates, tuple | list) or len(rates) != 2:
+            expected = "two numbers of at least 0, for the first and for the last step"
+            raise refuse("learning_rate", rates, expected)
+        rates = tuple(require_number("a rate in learning_rate", rate, 0) for rate in rates)
         object.__setattr__(self, "learning_rate", rates)
         batch = self.num_envs * self.rollout_length
         if self.minibatch_size % self.rollout_length or self.minibatch_size > batch:
@@ -248,23 +258,21 @@ class TrainConfig:
     @classmethod
     def at_scale(cls, scale: str, robot: str, **changes) -> "TrainConfig":
         """`smoke`, `reduced` or `full` by name."""
-        if scale not in SCALES:
-            raise ValueError(f"scale is {scale!r}; expected one of {', '.join(SCALES)}")
+        require_choice("scale", scale, SCALES)
         return getattr(cls, scale)(robot, **changes)
 
 
 def _default_name(robot: str, changes: dict) -> str:
     """Name of an agent: its robots' names, or those of their files, joined with "+"."""
-    return "+".join(_robot_name(name) for name in changes.get("robots", (robot,)))
+    robots = changes.get("robots", (robot,))
+    robots = (robots,) if isinstance(robots, str | Path) else require_list("robots", robots)
+    return "+".join(_robot_name(name) for name in robots)
 
 
 def _robot_name(name_or_path) -> str:
     """The name of a robot that is given by name or file, without reading the file."""
-    if not isinstance(name_or_path, str | Path):
-        raise TypeError(
-            f"a robot is {name_or_path!r}; expected a name or the path of a file, as a text or Path"
-        )
-    return Path(name_or_path).stem
+    path = require_path("robot", name_or_path)
+    return require_name("the name of the robot's file", path.stem)
 
 
 def _located(robot: str) -> str:
@@ -276,12 +284,6 @@ def _located(robot: str) -> str:
         return robot  # which `load_robot` reports
     # Links are not followed: the robot's name is that of the file as it was given.
     return robot if path == data_dir() / "robots" / f"{robot}.xml" else os.path.abspath(path)
-
-
-def _is_number(value, high: float) -> bool:
-    """Whether a value is a finite number from 0 to `high`."""
-    number = isinstance(value, int | float) and not isinstance(value, bool)
-    return number and 0 <= value <= high and value < math.inf
 
 
 @jax.tree_util.register_dataclass
@@ -306,6 +308,11 @@ def advantages(reward, value, last_value, terminated, truncated, discount, gae_l
     one would have gone on: its last state's value stands for that of the next state, one control
     step later.
     """
+    for name, array in (("reward", reward), ("value", value), ("terminated", terminated)):
+        require_shape(name, array, ("N", "T"))
+    for name, array in (("value", value), ("terminated", terminated), ("truncated", truncated)):
+        require_shape(name, array, reward.shape)
+    require_shape("last_value", last_value, reward.shape[:1])
     done = terminated | truncated
     following = jnp.concatenate([value[:, 1:], last_value[:, None]], 1)
     following = jnp.where(truncated, value, following)
@@ -334,6 +341,8 @@ def command_changes(observation: Observation, last_observation: Observation):
 
 def make_policy_function(policy: Policy, mean_actions: bool = False):
     """The policy as `Locomotion.rollout` wants it; extra is the log density of the action."""
+    require_kind("policy", policy, Policy, "shapebody.Policy(...)")
+    require_flag("mean_actions", mean_actions)
 
     def act(variables, key, descriptions, observation):
         mean, std = policy.apply(variables, descriptions, observation)
@@ -364,6 +373,9 @@ def _apply(network, variables, descriptions, slot, observation):
 
 def make_update(config: TrainConfig, policy: Policy, critic: Critic):
     """The learner's iteration: (Learner, Trajectory, key) -> (Learner, metrics)."""
+    require_kind("config", config, TrainConfig, "such as TrainConfig.reduced(...)")
+    require_kind("policy", policy, Policy, "shapebody.Policy(...)")
+    require_kind("critic", critic, Critic, "shapebody.Critic(...)")
     optimizer = optax.chain(
         optax.clip_by_global_norm(config.max_gradient_norm), optax.scale_by_adam(eps=1e-5)
     )
@@ -574,11 +586,14 @@ class Trainer:
     """
 
     def __init__(self, config: TrainConfig, folder=None, engine: str = "auto", policy=None):
+        _require_run(config, engine)
+        if policy is not None and not (isinstance(policy, Mapping) and "params" in policy):
+            raise refuse("policy", policy, "variables of a Policy, such as agent.policy")
         keep_memory()
         robots = tuple(_located(robot) for robot in config.robots)
         config = config if robots == config.robots else replace(config, robots=robots)
         self.config = config
-        self.folder = Path(folder) if folder else data_dir() / "checkpoints" / config.name
+        self.folder = chosen_folder(folder, config.name)
         robots = [load_robot(name) for name in config.robots]
         task = config.task
         if not config.learn_policy:
@@ -737,7 +752,7 @@ class Trainer:
 
         folder: where to; the run's own if not given.
         """
-        folder = Path(folder) if folder else self.folder
+        folder = self.folder if folder is None else require_path("folder", folder)
         agent = self.agent(self.state_bank())
         rows, _ = _rows(self.folder / "training.csv")
         save_agent(agent, folder, rows or None)
@@ -751,6 +766,8 @@ class Trainer:
 
     def last_iteration(self, max_steps=None) -> int:
         """Number of finished iterations at which `run` ends with that budget."""
+        if max_steps is not None:
+            require_integer("max_steps", max_steps, 0, MOST_STEPS)
         last = self.config.iterations
         return last if max_steps is None else min(last, max_steps // self.config.batch)
 
@@ -767,6 +784,9 @@ class Trainer:
             ValueError: if another process trains in the same folder, or has trained there since
                 `start`; if the simulation of a robot always fails.
         """
+        _require_budget(max_steps, max_seconds, progress)
+        if curve_interval is not None:
+            require_integer("curve_interval", curve_interval, 1)
         config = self.config
         number, last = int(self.learner.iteration), self.last_iteration(max_steps)
         if number >= last:
@@ -828,6 +848,7 @@ class Trainer:
         Returns (Observation [M, ...] of numpy arrays, robot index int32[M]); None if the
         simulation fails in every step. Rollouts that fail so are left out.
         """
+        require_integer("rollouts", rollouts, 1, 100_000)
         count = self.config.state_bank
         env = self.env
         if not env.config.fixed_coefficient:
@@ -954,7 +975,10 @@ def train(
             steps than the run that is to go on, or if the run there cannot be continued with
             `config`.
     """
-    require_kind("config", config, TrainConfig, 'for example TrainConfig.reduced("unitree_go2")')
+    _require_run(config, engine)
+    _require_budget(max_steps, max_seconds, progress)
+    for name, value in (("state_only", state_only), ("replace", replace)):
+        require_flag(name, value)
     given = {"robots": config.robots, "name": config.name}
     if config == TrainConfig.at_scale(config.scale, config.robots[0], **given):
         config = as_continued(config, folder)
@@ -985,6 +1009,20 @@ def train(
 
 STATE_FILES = ("training.safetensors", "training.json", "training.csv")
 """A run in its folder: its state, its configurations and its learning curve."""
+
+
+def _require_run(config, engine: str = "auto") -> None:
+    hint = 'for example TrainConfig.reduced("unitree_go2")'
+    require_kind("config", config, TrainConfig, hint)
+    require_engine("engine", engine)
+
+
+def _require_budget(max_steps, max_seconds, progress) -> None:
+    if max_steps is not None:
+        require_integer("max_steps", max_steps, 0, MOST_STEPS)
+    if max_seconds is not None:
+        require_number("max_seconds", max_seconds, 0)
+    require_flag("progress", progress)
 
 
 def _metadata(folder: Path) -> dict | None:
@@ -1056,7 +1094,12 @@ def anneal(
             the agent in the folder has more steps or a critic from policy evaluation, or the copy
             that was stopped is of another step of the run or has other settings.
     """
-    folder = Path(folder) if folder else data_dir() / "checkpoints" / name
+    require_integer("steps", steps, 1, MOST_STEPS)
+    require_number("last_rate", last_rate, 0)
+    require_engine("engine", engine)
+    _require_budget(None, max_seconds, progress)
+    require_flag("replace", replace)
+    folder = chosen_folder(folder, name)
     copy = folder / "annealed"
     engine = _engine(folder, engine)
     config = _begin_annealing(folder, copy, steps, last_rate, replace)
@@ -1103,7 +1146,7 @@ def _begin_annealing(
             f"last_rate is {last_rate:g}, above the present rate of the run, {rate:g}: give a "
             "lower one"
         )
-    more = max(1, round(require_integer("steps", steps, 1) / batch))
+    more = max(1, round(steps / batch))
     # Linear over the whole run, through the present rate now and the last one at the end.
     slope = (last_rate - rate) / more
     config |= {
@@ -1171,15 +1214,21 @@ def train_critic(
         training, with those of this phase under "policy_evaluation". If the phase was stopped
         before its end, `agent` itself, and nothing in the folder is replaced.
     """
+    require_agent(agent)
+    require_kind("critic", critic, CriticConfig, "shapebody.CriticConfig.sharp()")
+    if steps is not None:
+        require_integer("steps", steps, 1, MOST_STEPS)
+    require_engine("engine", engine)
+    _require_budget(None, max_seconds, progress)
     if folder is None:
-        folder = data_dir() / "checkpoints" / require_folder_name("the agent's name", agent.name)
+        folder = chosen_folder(None, agent.name)
         # The agent may come from elsewhere, and its name be that of another one here.
         if _metadata(folder) and load_agent(folder).policy_hash != agent.policy_hash:
             raise ValueError(
                 f"the agent in {folder} has another policy than agent {agent.name!r}, whose new "
                 "critic would be saved there; give its own folder (folder=...)"
             )
-    folder = Path(folder)
+    folder = require_path("folder", folder)
     missing = [name for name in ("config", "scale") if name not in agent.metadata]
     if missing:
         raise ValueError(
@@ -1269,7 +1318,8 @@ def as_continued(config: TrainConfig, folder=None) -> TrainConfig:
     with the settings that it was begun with, whatever the defaults are now. To change one that may
     change (`CHANGEABLE`, `CHANGEABLE_INSIDE`), replace it in the result.
     """
-    folder = Path(folder) if folder else data_dir() / "checkpoints" / config.name
+    _require_run(config)
+    folder = chosen_folder(folder, config.name)
     if not (folder / "training.safetensors").exists():
         return config
     try:
@@ -1317,7 +1367,7 @@ def _phases(path: Path) -> list[dict]:
                 if not isinstance(phase.get(name, kind()), kind):
                     raise ValueError(f"{name} of a phase is of another kind than {kind.__name__}")
             if phase.get("engine", "native") not in ("native", "mjx"):
-                raise ValueError(f"the engine is {shortened(phase['engine'])}")
+                raise ValueError(f"the engine is {shown(phase['engine'])}")
     except ValueError as error:
         raise ValueError(
             f"{path.name} is missing or damaged ({error}); it says how the run in {path.parent} "

@@ -6,10 +6,10 @@ the numbers, little-endian float32. The files are not part of this package.
 """
 
 import json
-from pathlib import Path
 
 import numpy as np
 
+from shapebody.checks import require_name, require_path
 from shapebody.networks import (
     GENERAL,
     JOINT_DESCRIPTION,
@@ -43,8 +43,10 @@ def load_published_policy(folder, name=None):
         FileNotFoundError: if a file is missing.
         ValueError: if the name is needed, or if the files do not describe such a policy.
     """
-    folder = Path(folder)
-    if name is None:
+    folder = require_path("folder", folder)
+    if name is not None:
+        require_name("name", name)
+    else:
         found = sorted(path.name.split(".")[0] for path in folder.glob("*.weights.json"))
         if not found:
             raise FileNotFoundError(

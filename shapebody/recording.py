@@ -14,6 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from shapebody.checkpoints import Agent, require_agent
+from shapebody.checks import require_array, require_kind, require_number, require_seed
 from shapebody.descriptions import Descriptions
 from shapebody.design import DesignSpace
 from shapebody.locomotion import CONTROL_STEP, Locomotion, Observation, TaskConfig, randomization
@@ -101,12 +102,13 @@ def record_episode(
     design = space.validate(space.reference if design is None else design)
     if design.ndim != 1:
         raise ValueError(f"design has shape {design.shape}; expected one design [{space.dim}]")
-    if not 0 <= coefficient <= 1:
-        raise ValueError(f"coefficient is {coefficient!r}; expected a number in [0, 1]")
-    if not seconds >= CONTROL_STEP:
-        raise ValueError(f"seconds is {seconds!r}; expected at least one step, {CONTROL_STEP}")
-    task = task or TaskConfig.evaluation()
+    require_number("coefficient", coefficient, 0, 1)
+    require_number("seconds", seconds, CONTROL_STEP, hint="one control step, or more")
+    require_seed("seed", seed)
+    task = TaskConfig.evaluation() if task is None else task
+    require_kind("task", task, TaskConfig, "TaskConfig.evaluation(...)")
     if command is not None:
+        command = require_array("command (vx, vy, yaw rate)", command, (3,))
         task = dataclasses.replace(task, command_change=0.0)
     env = _environment(robot, task)
     key = jax.random.PRNGKey(seed)
@@ -145,10 +147,7 @@ def record_episode(
 
 
 def _with_command(state, command):
-    command = np.asarray(command, np.float32)
-    if command.shape != (3,) or not np.isfinite(command).all():
-        raise ValueError(f"command is {command}; expected three finite numbers (vx, vy, yaw rate)")
-    command = jnp.asarray(command)[None]
+    command = jnp.asarray(command, jnp.float32)[None]
     keep = jax.vmap(randomization.keep_nominal)(state.descriptions, command)
     return dataclasses.replace(state, command=command, keep_nominal=keep)
 

@@ -15,7 +15,8 @@ from pathlib import Path
 import mujoco
 import numpy as np
 
-from shapebody.checks import require_kind
+from shapebody.checks import require_kind, require_path
+from shapebody.checks import shown as shortened
 from shapebody.feet import ends_without_foot, foot_ids, lowest, standing_height
 from shapebody.finite import check_inertials, check_numbers, check_text, is_finite
 from shapebody.inference import complete
@@ -34,7 +35,7 @@ _OBJ, _JOINT, _SENSOR = mujoco.mjtObj, mujoco.mjtJoint, mujoco.mjtSensor
 
 def require_robot(robot) -> "Robot":
     """The argument; TypeError if it is no Robot, such as a name."""
-    require_kind("robot", robot, Robot, f"load it with shapebody.load_robot({robot!r})")
+    require_kind("robot", robot, Robot, f"load it with shapebody.load_robot({shortened(robot)})")
     return robot
 
 
@@ -163,10 +164,7 @@ def load_robot(name_or_path: str | Path) -> Robot:
 
 def find(name_or_path: str | Path) -> Path:
     """The file of a robot given by name or path. Raises as `load_robot`."""
-    if not isinstance(name_or_path, str | Path):
-        raise TypeError(
-            f"load_robot expects a robot name or a path, got {type(name_or_path).__name__}"
-        )
+    path = require_path("robot", name_or_path)
     text = str(name_or_path)
     looks_like_a_path = "/" in text or os.sep in text or text.lower().endswith(SUFFIXES)
     if isinstance(name_or_path, str) and not looks_like_a_path:
@@ -174,20 +172,20 @@ def find(name_or_path: str | Path) -> Path:
         if text in names:
             return data_dir() / "robots" / f"{text}.xml"
         if not os.path.exists(text):
-            close = difflib.get_close_matches(text, names, n=3, cutoff=0.5)
+            close = difflib.get_close_matches(text[:100], names, n=3, cutoff=0.5)
             hint = f" Did you mean {' or '.join(map(repr, close))}?" if close else ""
             raise ValueError(
-                f"unknown robot {text!r}.{hint} Available robots: {', '.join(names) or 'none'}. "
+                f"unknown robot {shortened(text)}.{hint} "
+                f"Available robots: {', '.join(names) or 'none'}. "
                 "For a file of your own give its path, e.g. 'my_robot.xml' or 'my_robot.urdf'"
             )
-    path = Path(text).expanduser()
     if path.is_dir():
         files = sorted(f.name for f in path.iterdir() if f.suffix.lower() in SUFFIXES)
         inside = f"one of its files: {', '.join(files[:8])}" if files else "an MJCF file"
         raise ValueError(f"{path} is a folder: expected a file; give the path of {inside}")
     if not path.is_file():
         raise FileNotFoundError(
-            f"robot file {text!r} does not exist (looked at {path.absolute()}): "
+            f"robot file {shortened(text)} does not exist (looked at {path.absolute()}): "
             "give the path of an MJCF or URDF file, or one of the names of shapebody.robots()"
         )
     return path

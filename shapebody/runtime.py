@@ -12,6 +12,8 @@ def cache_folder() -> Path:
 
     JAX_COMPILATION_CACHE_DIR if set; otherwise `shapebody/jax` in the user's cache folder, with one
     subfolder per processor type, because compiled CPU programs do not run on every processor.
+
+    Raises RuntimeError where HOME is not set and the system does not know the user's home either.
     """
     chosen = os.environ.get("JAX_COMPILATION_CACHE_DIR")
     if chosen:
@@ -42,10 +44,10 @@ def enable_compilation_cache() -> Path | None:
     """
     import jax
 
-    folder = cache_folder()
     try:
+        folder = cache_folder()
         folder.mkdir(parents=True, exist_ok=True)
-    except OSError:
+    except (OSError, ValueError, RuntimeError):  # RuntimeError: nobody knows the home folder
         return None
     if not os.access(folder, os.W_OK):
         return None

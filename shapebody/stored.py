@@ -20,6 +20,8 @@ from typing import Any
 import numpy as np
 import safetensors.numpy
 
+from shapebody.checks import shown
+
 TEXT_LIMIT = 2**26
 """Bytes of the largest text file that is read, 64 MiB; shipped ones have less than one."""
 HEADER_LIMIT = 2**24
@@ -28,41 +30,6 @@ ARRAYS_LIMIT = 2**28
 """Bytes of the largest state bank, expanded: 256 MiB. Shipped ones have less than one."""
 DEPTH_LIMIT = 64
 """Lists and objects inside each other in a JSON file."""
-NAME_LIMIT = 200
-"""Bytes of the longest name of an agent or a result; file systems allow 255 with all suffixes."""
-
-
-def require_folder_name(what: str, name) -> str:
-    """The name, if a file or folder can have it anywhere; ValueError otherwise.
-
-    Refused are texts that lead elsewhere (separators, "..", "~") or that file systems refuse.
-    """
-    sound = (
-        isinstance(name, str)
-        and name.isprintable()
-        and name.strip() == name != ""
-        and not set(name) & set('/\\:*?"<>|')
-        and name[0] not in ".~-"
-        and len(name.encode()) <= NAME_LIMIT
-    )
-    if not sound:
-        raise ValueError(
-            f"{what} is {shortened(name)}; expected the name of a folder, without separators: "
-            f"letters, digits and signs such as _ - + ., at most {NAME_LIMIT} bytes; give another "
-            "name"
-        )
-    return name
-
-
-def shortened(value) -> str:
-    """`repr` of a value, at most about 100 characters of it."""
-    # Not repr of the whole, which of deeply nested lists is an error and of long ones takes long.
-    if isinstance(value, str | bytes):
-        return repr(value) if len(value) <= 100 else f"{value[:80]!r}... ({len(value)} characters)"
-    if isinstance(value, dict | list | tuple) and len(value) > 8:
-        return f"a {type(value).__name__} of {len(value)}"
-    text = repr(value)
-    return text if len(text) <= 100 else f"{text[:80]}..."
 
 
 # ---------------------------------------------------------------------- texts
@@ -70,7 +37,7 @@ def shortened(value) -> str:
 
 def read_text(path: Path, fix: str) -> str:
     """A UTF-8 text of at most `TEXT_LIMIT` bytes."""
-    require_file(path, fix)
+    require_regular_file(path, fix)
     size = path.stat().st_size
     if size > TEXT_LIMIT:
         raise ValueError(f"{path} has {size:,} bytes, more than {TEXT_LIMIT:,}; {fix}")
@@ -80,7 +47,7 @@ def read_text(path: Path, fix: str) -> str:
         raise ValueError(f"{path} is damaged: it is no UTF-8 text ({error}); {fix}") from error
 
 
-def require_file(path: Path, fix: str) -> None:
+def require_regular_file(path: Path, fix: str) -> None:
     """FileNotFoundError if there is nothing, ValueError for a folder, pipe or device."""
     if not path.exists():
         raise FileNotFoundError(f"{path} does not exist; {fix}")
@@ -140,11 +107,11 @@ def from_plain(kind, values, what: str = ""):
     """
     what = what or kind.__name__
     if not isinstance(values, dict):
-        raise ValueError(f"{what} is {shortened(values)}; expected an object with settings")
+        raise ValueError(f"{what} is {shown(values)}; expected an object with settings")
     hints = typing.get_type_hints(kind)
     unknown = sorted(values.keys() - hints.keys())
     if unknown:
-        raise ValueError(f"{what} has the unknown setting {shortened(unknown[0])}")
+        raise ValueError(f"{what} has the unknown setting {shown(unknown[0])}")
     given = {name: _value(hints[name], x, f"{what}.{name}") for name, x in values.items()}
     try:
         return kind(**given)
@@ -167,7 +134,7 @@ def _value(hint, given, what: str):
         same = inside[1:] == (...,)
         if not isinstance(given, list) or not (same or len(given) == len(inside)):
             many = "a list" if same else f"a list of {len(inside)}"
-            raise ValueError(f"{what} is {shortened(given)}; expected {many}")
+            raise ValueError(f"{what} is {shown(given)}; expected {many}")
         hints = inside[:1] * len(given) if same else inside
         pairs = zip(hints, given, strict=True)
         return tuple(_value(h, x, f"{what}[{i}]") for i, (h, x) in enumerate(pairs))
@@ -177,7 +144,7 @@ def _value(hint, given, what: str):
         kinds, words = _KINDS[hint]
         number = isinstance(given, int | float) and abs(given) >= 2**63
         if not isinstance(given, kinds) or (isinstance(given, bool) and hint is not bool) or number:
-            raise ValueError(f"{what} is {shortened(given)}; expected {words}")
+            raise ValueError(f"{what} is {shown(given)}; expected {words}")
     return given
 
 
@@ -235,7 +202,7 @@ def read_metadata(path: Path, fix: str) -> dict[str, str]:
 
 def _safetensors_header(path: Path, fix: str):
     """(shapes and types, places in the file, metadata); the arrays fill the rest of the file."""
-    require_file(path, fix)
+    require_regular_file(path, fix)
     try:
         size = path.stat().st_size
         with open(path, "rb") as file:
@@ -249,7 +216,7 @@ def _safetensors_header(path: Path, fix: str):
         for name, entry in by_place:
             shape, dtype = tuple(entry["shape"]), _DTYPES[entry["dtype"]]
             if not all(type(x) is int and x >= 0 for x in shape):
-                raise ValueError(f"{name} has shape {shortened(shape)}")
+                raise ValueError(f"{name} has shape {shown(shape)}")
             header[name], places[name] = (shape, dtype), end
             end += math.prod(shape) * dtype.itemsize
             if entry["data_offsets"] != [places[name] - 8 - length, end - 8 - length]:
@@ -275,7 +242,7 @@ def read_npz(path: Path, expected: Mapping[str, tuple], fix: str) -> dict[str, n
     expected: by name, shape and type. The first axis is the same of all arrays, and may have any
     length (None); all together have at most `ARRAYS_LIMIT` bytes.
     """
-    require_file(path, fix)
+    require_regular_file(path, fix)
     problems, arrays = [], {}
     try:
         with zipfile.ZipFile(path) as archive:
@@ -283,7 +250,7 @@ def read_npz(path: Path, expected: Mapping[str, tuple], fix: str) -> dict[str, n
             if len(entries) < len(archive.infolist()):
                 raise ValueError("an array is there twice")
             problems += [f"{name} is missing" for name in expected if name not in entries]
-            problems += [f"{shortened(x)} is unknown" for x in entries if x not in expected]
+            problems += [f"{shown(x)} is unknown" for x in entries if x not in expected]
             if any(x.compress_type not in _COMPRESSIONS for x in entries.values()):
                 raise ValueError("a compression that np.savez does not use")
             total = sum(entry.file_size for entry in entries.values())

@@ -3,7 +3,6 @@
 Section 4.1 (methods), Appendix D (trust region).
 """
 
-import numbers
 from dataclasses import asdict, replace
 from functools import partial
 from typing import NamedTuple
@@ -12,7 +11,19 @@ import numpy as np
 
 from shapebody import paper
 from shapebody.checkpoints import require_agent
-from shapebody.checks import require_integer, require_kind
+from shapebody.checks import (
+    refuse,
+    require_choice,
+    require_flag,
+    require_integer,
+    require_kind,
+    require_list,
+    require_number,
+    require_records,
+    require_seed,
+    require_text,
+    shown,
+)
 from shapebody.design import DesignSpace
 from shapebody.evaluation import EvaluationConfig, evaluate, paired_gain
 from shapebody.experiments import (
@@ -26,6 +37,7 @@ from shapebody.experiments import (
 from shapebody.locomotion import TaskConfig
 from shapebody.paths import data_dir
 from shapebody.published import load_published_policy
+from shapebody.robots import require_robot
 from shapebody.search import METHODS, Objective, search
 
 
@@ -102,13 +114,11 @@ def design_study(
         ValueError: for a run or a setting that cannot be, before anything is computed.
     """
     require_agent(agent)
-    setting = _setting(starts, episodes, horizon, seed, first_start)
-    for name, value in setting.items():
-        require_integer(name, value, 0 if name in ("seed", "first_start") else 1)
-    short = {} if iterations is None else {"iterations": iterations}
-    for run in runs:
-        require_kind("a run", run, Run, 'for example studies.Run("vgds", 100.0)')
-        _validate(run, short)
+    require_robot(robot)
+    runs, setting, short = _settings(
+        runs, starts, episodes, horizon, seed, first_start, iterations, recompute
+    )
+    require_flag("progress", progress)
     name = _file(robot, first_start)
     setting = _as_stored(name, agent, setting, short)
     parts = {"starts and reference": partial(_initial_records, agent, robot, **setting)}
@@ -117,6 +127,20 @@ def design_study(
     return result_in_parts(
         name, parts, agent, recompute, progress, _searches(runs, short), **setting, **short
     )
+
+
+def _settings(runs, starts, episodes, horizon, seed, first_start, iterations, recompute):
+    """(runs, setting, settings of every search) of a study; ValueError for what cannot be."""
+    setting = _setting(starts, episodes, horizon, seed, first_start)
+    for name, value in setting.items():
+        require_integer(name, value, 0 if name in ("seed", "first_start") else 1, 1_000_000)
+    short = {} if iterations is None else {"iterations": iterations}
+    runs = require_list("runs", runs)
+    for run in runs:
+        require_kind("a run", run, Run, 'for example studies.Run("vgds", 100.0)')
+        _validate(run, short)
+    require_flag("recompute", recompute)
+    return runs, setting, short
 
 
 def _searches(runs, short: dict) -> dict[str, dict]:
@@ -139,15 +163,14 @@ def _as_stored(name, agent, setting: dict, short: dict) -> dict:
 
 
 def _validate(run: Run, settings: dict) -> None:
-    if run.method not in METHODS:
-        raise ValueError(f"unknown method {run.method!r} in {run}; known: {', '.join(METHODS)}")
-    if run.origin not in ("start", "reference"):
-        raise ValueError(f"origin is {run.origin!r} in {run}; expected 'start' or 'reference'")
+    if not isinstance(run.method, str) or run.method not in METHODS:
+        raise ValueError(f"unknown method in {shown(run)}; known: {', '.join(METHODS)}")
+    require_choice("origin of a run", run.origin, ("start", "reference"))
     value, alone = run.trust_region, run.method == CONTROL.method
     if alone and value is not None:
-        raise ValueError(f"trust_region is {value!r} in {run}; expected None, it has no λ")
-    if not alone and not (isinstance(value, numbers.Real) and 0 <= value < np.inf):
-        raise ValueError(f"trust_region is {value!r} in {run}; expected a number of at least 0")
+        raise refuse(f"trust_region of {run.method}", value, "None, it has no λ")
+    if not alone:
+        require_number(f"trust_region of {run.method}", value, 0)
     METHODS[run.method].config(**settings)  # refuses what the method cannot use
 
 
@@ -170,6 +193,9 @@ def installed(runs) -> tuple[Run, ...]:
     """Those of `runs` whose libraries are there: "bo" needs the extra `bo`."""
     from importlib.util import find_spec
 
+    runs = require_list("runs", runs)
+    for run in runs:
+        require_kind("a run", run, Run, 'for example studies.Run("vgds", 100.0)')
     return tuple(run for run in runs if run.method != "bo" or find_spec("botorch"))
 
 
@@ -189,8 +215,11 @@ def available(
 
     All but "bo" always; "bo" where its libraries are `installed`, or where its part is stored.
     """
-    setting = _setting(starts, episodes, horizon, seed, first_start)
-    short = {} if iterations is None else {"iterations": iterations}
+    require_agent(agent)
+    require_robot(robot)
+    runs, setting, short = _settings(
+        runs, starts, episodes, horizon, seed, first_start, iterations, recompute
+    )
     name = _file(robot, first_start)
     setting = _as_stored(name, agent, setting, short)
     searches = _searches(runs, short)
@@ -292,8 +321,13 @@ def gains(records: list[dict], quantity: str = "return") -> list[dict]:
         ValueError: if a design has no counterpart to be compared with, or the records come from
             two engines.
     """
+    records = require_records("records", records, ("origin", "method", "trust_region", "start"))
+    require_text("quantity", quantity)
     # Returns are stored by episode, other quantities as means.
     detail = "returns" if quantity == "return" else quantity
+    for record in records:
+        if detail not in record:
+            raise ValueError(f"quantity is {shown(quantity)}; expected one of {', '.join(record)}")
     found: dict = {}
     for record in records:
         if record["origin"] == "start":
@@ -348,12 +382,20 @@ def gains(records: list[dict], quantity: str = "return") -> list[dict]:
 
 def gain(rows: list[dict], method: str, over: str, trust_region: float | None = None) -> dict:
     """The one row of `gains` with that method, comparison and λ; ValueError if there is none."""
+    require_text("method", method)
+    require_text("over", over)
+    if trust_region is not None:
+        require_number("trust_region", trust_region, 0)
     wanted = {"method": method, "over": over, "trust_region": trust_region}
+    rows = require_records("rows", rows, wanted)
     for row in rows:
         if all(row[name] == value for name, value in wanted.items()):
             return row
     known = ", ".join(f"{r['method']} over {r['over']} at {r['trust_region']}" for r in rows)
-    raise ValueError(f"there is no gain of {method} over {over} at {trust_region}; known: {known}")
+    raise ValueError(
+        f"there is no gain of {shown(method)} over {shown(over)} at {trust_region}; "
+        f"known: {known or 'none'}"
+    )
 
 
 def value_against_return(
@@ -370,7 +412,10 @@ def value_against_return(
     Returns:
         One record per design: its number, predicted value and mean return.
     """
-
+    require_agent(agent)
+    _require_counts(designs=designs, episodes=episodes, horizon=horizon)
+    require_seed("seed", seed)
+    require_flag("progress", progress)
     space = DesignSpace(robot)
     f = np.stack([space.start(seed + i) for i in range(designs)])
     predicted = np.asarray(Objective.of(agent, robot, 0.0).value(f))
@@ -405,8 +450,12 @@ def size_share(
         One record per body: kept ("reference", "all", "size only", "all but size"), start number
         (None for the reference), predicted value, and the returns of all episodes.
     """
+    require_agent(agent)
+    _require_counts(starts=starts, episodes=episodes, horizon=horizon)
+    require_seed("seed", seed)
     space = DesignSpace(robot)
     short = {} if iterations is None else {"iterations": iterations}
+    METHODS["vgds"].config(**short)  # refuses wrong iterations
     initial = np.stack([space.start(i) for i in range(starts)])
     found = search("vgds", agent, robot, initial, trust_region=100.0, seed=seed, **short).design
     size = np.zeros(space.dim, bool)
@@ -432,6 +481,11 @@ def size_share(
     ]
 
 
+def _require_counts(**counts) -> None:
+    for name, value in counts.items():
+        require_integer(name, value, 1, 1_000_000)
+
+
 def published_policy(robot, agent, folder=None, starts: int = 10, episodes: int = 16) -> dict:
     """Returns that the authors' published policy earns in our environment.
 
@@ -452,6 +506,9 @@ def published_policy(robot, agent, folder=None, starts: int = 10, episodes: int 
     Raises:
         FileNotFoundError: if nothing is stored and no folder is given.
     """
+    require_robot(robot)
+    require_agent(agent)
+    _require_counts(starts=starts, episodes=episodes)
     name = f"published_policy_{robot.name}"
     if folder is None:
         # Theirs is the same policy at all scales.

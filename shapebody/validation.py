@@ -10,6 +10,7 @@ from pathlib import Path
 import mujoco
 import numpy as np
 
+from shapebody.checks import require_output, require_path
 from shapebody.feet import ends_without_foot
 from shapebody.inference import FLOOR_TOLERANCE, leg_torque
 from shapebody.robots import Robot, examine, find, tilt
@@ -61,7 +62,7 @@ class Report:
                 f"{self.path} has {len(self.problems)} problems, so there is no completed file to "
                 "write; correct them first"
             )
-        path = Path(path)
+        path = require_output("path", path)
         itself = path.exists() and path.samefile(self.path)
         if itself and path.read_bytes().decode("utf-8-sig") != self.robot.xml:
             raise ValueError(
@@ -108,10 +109,11 @@ class Report:
 def validate_robot(name_or_path: str | Path) -> Report:
     """Report on a robot file (MJCF or URDF), or a robot of `robots()`.
 
-    Everything that `load_robot` would raise for the file is a problem of the report; only a value
-    that is neither a name nor a path raises TypeError. Takes well under a second without meshes.
+    Everything that `load_robot` would raise for the file is a problem of the report; a value that
+    can be neither a name nor a path raises TypeError or ValueError. Takes well under a second
+    without meshes.
     """
-    path = Path(name_or_path)
+    path = require_path("robot", name_or_path)
     try:
         return _report(find(name_or_path))
     except (ValueError, OSError) as error:

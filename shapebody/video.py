@@ -23,6 +23,16 @@ import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
 from shapebody import drawing
+from shapebody.checks import (
+    refuse,
+    require_array,
+    require_flag,
+    require_integer,
+    require_list,
+    require_number,
+    require_output,
+    require_text,
+)
 from shapebody.files import atomic_write
 
 SHOWN_GROUPS = (0, 1, 2)
@@ -114,10 +124,10 @@ class Renderer:
         smooth: bool = False,
         opengl: bool = True,
     ):
-        if min(height, width) < 16:
-            raise ValueError(
-                f"pictures of {height} x {width} pixels are too small; give 16 or more"
-            )
+        model = _model_of(model)
+        require_size(height, width)
+        for name, value in (("spheres", spheres), ("smooth", smooth), ("opengl", opengl)):
+            require_flag(name, value)
         self.height, self.width = height, width
         self._detail = 2 if smooth else 1
         rows, columns = self._detail * height, self._detail * width
@@ -184,6 +194,7 @@ class Renderer:
 
     def place(self, qpos) -> None:
         """Forward kinematics at `qpos`[nq]."""
+        qpos = _check_qpos(self.model, qpos, 1)
         self.data.qpos[:] = qpos
         mujoco.mj_kinematics(self.model, self.data)
         mujoco.mj_comPos(self.model, self.data)
@@ -191,6 +202,8 @@ class Renderer:
 
     def distance(self, lookat, azimuth: float = 130.0, elevation: float = -18.0) -> float:
         """Smallest camera distance in m from `lookat` that shows every visible geom."""
+        lookat = require_array("lookat", lookat, (3,))
+        _require_camera(1.0, azimuth, elevation)
         if len(self.geoms) == 0:
             return 2 * float(self.model.stat.extent)
         right, up, forward = drawing.view_axes(azimuth, elevation)
@@ -217,8 +230,9 @@ class Renderer:
         distance: of the camera from it in m; if None, so that the robot fills the picture. Angles
         in degrees.
         """
+        _require_camera(distance, azimuth, elevation)
         self.place(qpos)
-        lookat = self.centre() if lookat is None else np.asarray(lookat, float)
+        lookat = self.centre() if lookat is None else require_array("lookat", lookat, (3,))
         if distance is None:
             distance = 1.03 * self.distance(lookat, azimuth, elevation)
         if self._pixels is None:
@@ -259,15 +273,30 @@ class Renderer:
 def _model_of(body) -> mujoco.MjModel:
     model = getattr(body, "model", body)
     if not isinstance(model, mujoco.MjModel):
-        raise TypeError(
-            f"expected a mujoco.MjModel or a Robot, got {type(body).__name__}; "
-            "for a design give space.to_model(f)"
-        )
+        expected = "a mujoco.MjModel or a Robot; for a design, space.to_model(f)"
+        raise refuse("body", body, expected, kind=TypeError)
     return model
 
 
+MOST_PIXELS = 8192
+"""Largest height and width of a picture."""
+
+
+def require_size(height, width) -> None:
+    """ValueError if there can be no picture of that size."""
+    require_integer("height", height, 16, MOST_PIXELS)
+    require_integer("width", width, 16, MOST_PIXELS)
+
+
+def _require_camera(distance, azimuth, elevation) -> None:
+    if distance is not None:
+        require_number("distance", distance, above=0)
+    require_number("azimuth", azimuth)
+    require_number("elevation", elevation)
+
+
 def _check_qpos(model, qpos, ndim):
-    qpos = np.asarray(qpos, float)
+    qpos = require_array("qpos", qpos, finite=False).astype(float)
     expected = f"[{'T, ' if ndim == 2 else ''}{model.nq}]"
     if qpos.ndim != ndim or qpos.shape[-1] != model.nq:
         raise ValueError(f"qpos has shape {list(qpos.shape)}, expected {expected}")
@@ -326,6 +355,12 @@ def render_frame(body, qpos=None, *, height=360, width=480, spheres=False, **cam
     Raises ValueError for a qpos of the wrong length, TypeError for something without a model.
     """
     model = _model_of(body)
+    unknown = camera.keys() - {"lookat", "distance", "azimuth", "elevation"}
+    if unknown:
+        raise TypeError(
+            f"render_frame has no argument {min(unknown)!r}; expected lookat, distance, azimuth or "
+            "elevation"
+        )
     qpos = standing_pose(model) if qpos is None else _check_qpos(model, qpos, 1)
     with Renderer(model, height, width, spheres, smooth=True) as renderer:
         return renderer.picture(qpos, **camera)
@@ -353,9 +388,13 @@ def render_rollout(
     qpos = _check_qpos(model, qpos, 2)
     if len(qpos) == 0:
         raise ValueError("qpos holds no rows, so there is nothing to show")
-    if fps <= 0 or step_seconds <= 0:
-        raise ValueError(f"fps {fps} and step_seconds {step_seconds} must be positive")
+    require_number("fps", fps, 0.01, 1000)
+    require_number("step_seconds", step_seconds, 1e-6, 1000)
+    require_size(height, width)
+    _require_camera(distance, azimuth, elevation)
     frames = max(1, round(len(qpos) * step_seconds * fps))
+    if frames > 100_000:
+        raise ValueError(f"fps is {fps}, which makes {frames:,} pictures; expected at most 100,000")
     rows = np.minimum((np.arange(frames) / (fps * step_seconds)).astype(int), len(qpos) - 1)
     with Renderer(model, height, width, spheres) as renderer:
         trunk = np.empty((len(rows), 3))
@@ -389,9 +428,9 @@ def side_by_side(*clips: np.ndarray, labels: Sequence[str] | None = None) -> np.
     """Clips (or pictures) of one height next to each other; short ones hold their last frame."""
     if not clips:
         raise ValueError("side_by_side needs at least one clip")
-    if labels is not None and len(labels) != len(clips):
-        raise ValueError(f"{len(labels)} labels for {len(clips)} clips; give one per clip")
-    clips = [np.asarray(clip) for clip in clips]
+    if labels is not None:
+        labels = _labels(labels, len(clips), "clips")
+    clips = [_pictures("a clip", clip) for clip in clips]
     shapes = {clip.shape[-3] for clip in clips}
     if len(shapes) > 1 or len({clip.ndim for clip in clips}) > 1:
         raise ValueError(
@@ -411,6 +450,8 @@ def side_by_side(*clips: np.ndarray, labels: Sequence[str] | None = None) -> np.
 
 def with_label(frames: np.ndarray, text: str) -> np.ndarray:
     """The picture or clip with a bar of text above it."""
+    frames = _pictures("frames", frames)
+    require_text("text", text)
     width = frames.shape[-2]
     bar_height = 26
     bar = Image.new("RGB", (width, bar_height), "white")
@@ -427,8 +468,8 @@ def with_label(frames: np.ndarray, text: str) -> np.ndarray:
 
 def film_strip(frames: np.ndarray, count: int = 6) -> np.ndarray:
     """One picture of `count` frames, evenly spread over the clip, left to right."""
-    if count < 1:
-        raise ValueError(f"count {count} must be 1 or more")
+    frames = _check_frames(frames)
+    require_integer("count", count, 1, 1000)
     rows = np.linspace(0, len(frames) - 1, count).round().astype(int)
     return np.concatenate([frames[row] for row in rows], axis=1)
 
@@ -448,13 +489,18 @@ def body_grid(
 
     qpos: one [nq] per body, the standing poses if None.
     """
-    models = [_model_of(body) for body in bodies]
+    models = [_model_of(body) for body in require_list("bodies", bodies, 10_000)]
     if not models:
-        raise ValueError("body_grid needs at least one body")
-    for name, given in (("qpos", qpos), ("labels", labels)):
-        if given is not None and len(given) != len(models):
-            raise ValueError(f"{len(given)} {name} for {len(models)} bodies; give one per body")
-    poses = [standing_pose(model) for model in models] if qpos is None else list(qpos)
+        raise ValueError("bodies is empty; expected at least one body")
+    if labels is not None:
+        labels = _labels(labels, len(models), "bodies")
+    if columns is not None:
+        require_integer("columns", columns, 1)
+    require_size(height, width)
+    _require_camera(None, azimuth, elevation)
+    poses = [standing_pose(m) for m in models] if qpos is None else require_list("qpos", qpos)
+    if len(poses) != len(models):
+        raise ValueError(f"{len(poses)} qpos for {len(models)} bodies; give one per body")
     poses = [_check_qpos(model, pose, 1) for model, pose in zip(models, poses, strict=True)]
     columns = min(columns or 5, len(models))
     with contextlib.ExitStack() as stack:
@@ -498,6 +544,7 @@ def ffmpeg() -> str | None:
 def encode_video(frames: np.ndarray, fps: float = 25.0) -> tuple[str, bytes]:
     """Media type and bytes of a clip: H.264 in MP4, or an animated GIF where ffmpeg is missing."""
     frames = _check_frames(frames)
+    require_number("fps", fps, 0.01, 1000)
     program = ffmpeg()
     if program is None:
         _say(_NO_FFMPEG)
@@ -533,22 +580,44 @@ def _encode_gif(frames, fps):
 
 
 def _check_frames(frames):
-    frames = np.asarray(frames)
-    if frames.ndim != 4 or frames.shape[-1] != 3 or frames.dtype != np.uint8 or len(frames) == 0:
+    frames = _pictures("frames", frames)
+    if frames.ndim != 4 or len(frames) == 0:
         raise ValueError(
             f"frames are {frames.dtype}{list(frames.shape)}, expected uint8[T, height, width, 3]"
         )
     return frames
 
 
+def _pictures(name, frames) -> np.ndarray:
+    """A picture or a clip; ValueError if it is none."""
+    frames = require_array(name, frames, kinds="u")
+    right = frames.ndim in (3, 4) and frames.shape[-1] == 3 and frames.dtype == np.uint8
+    if not right or 0 in frames.shape:
+        raise refuse(name, frames, "a picture uint8[height, width, 3] or a clip uint8[T, ...]")
+    return frames
+
+
+def _labels(labels, count: int, of: str) -> list[str]:
+    labels = require_list("labels", labels)
+    if len(labels) != count:
+        raise ValueError(f"{len(labels)} labels for {count} {of}; give one each")
+    return [require_text("a label", label) for label in labels]
+
+
 def video_html(frames: np.ndarray, fps: float = 25.0, width: int | None = None) -> str:
     """HTML of a clip with the data inside, so that it plays without any other file."""
+    _require_width(width)
     kind, data = encode_video(frames, fps)
     source = f"data:{kind};base64,{base64.b64encode(data).decode()}"
     width = width or np.shape(frames)[2]
     if kind.startswith("video"):
         return f'<video controls loop autoplay muted playsinline width="{width}" src="{source}">'
     return f'<img width="{width}" src="{source}">'
+
+
+def _require_width(width) -> None:
+    if width is not None:
+        require_integer("width", width, 1, 100_000)
 
 
 def show_video(frames: np.ndarray, fps: float = 25.0, width: int | None = None) -> None:
@@ -567,8 +636,22 @@ def show_image(picture: np.ndarray, width: int | None = None, colours: int | Non
     from IPython.display import Image as Shown
     from IPython.display import display
 
-    image = Image.fromarray(np.asarray(picture))
+    picture = require_array("picture", picture, kinds="u")
+    if (
+        picture.dtype != np.uint8
+        or picture.ndim not in (2, 3)
+        or picture.shape[2:]
+        not in (
+            (),
+            (3,),
+            (4,),
+        )
+    ):
+        raise refuse("picture", picture, "uint8[height, width, 3]")
+    _require_width(width)
+    image = Image.fromarray(picture)
     if colours is not None:
+        require_integer("colours", colours, 2, 256)
         image = image.quantize(colours, Image.Quantize.FASTOCTREE)  # keeps rare bright colours
     buffer = io.BytesIO()
     image.save(buffer, format="PNG", optimize=True)
@@ -577,6 +660,7 @@ def show_image(picture: np.ndarray, width: int | None = None, colours: int | Non
 
 def save_video(path: str | Path, frames: np.ndarray, fps: float = 25.0) -> Path:
     """Write a clip; the suffix becomes .gif where ffmpeg is missing. Returns the path written."""
+    path = require_output("path", path)
     kind, data = encode_video(frames, fps)
-    path = Path(path).with_suffix(".mp4" if kind == "video/mp4" else ".gif")
+    path = path.with_suffix(".mp4" if kind == "video/mp4" else ".gif")
     return atomic_write(path, data)

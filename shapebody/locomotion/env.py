@@ -6,6 +6,7 @@ share one batch: joints, feet and spheres are padded to the largest robot and ma
 """
 
 import copy
+import inspect
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
@@ -15,7 +16,18 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from shapebody.checks import require_integer
+from shapebody.checks import (
+    refuse,
+    require_array,
+    require_engine,
+    require_flag,
+    require_function,
+    require_integer,
+    require_key,
+    require_kind,
+    require_list,
+    require_number,
+)
 from shapebody.descriptions import Descriptions, Sizes, describe, kinematics
 from shapebody.design import DesignSpace, quaternion_product
 from shapebody.locomotion import episode as episodes
@@ -29,6 +41,9 @@ from shapebody.robots import Robot, require_robot
 RESET_SLOTS = 16
 """Finished environments are restarted in chunks of this size, so that one compiled
 function serves any number of them."""
+
+MOST_ENVIRONMENTS = 2**20
+"""Largest batch."""
 
 START_SETTINGS = ("horizon", "command", "initial", "action_delay", "delay", "mixed_delay")
 """Beginnings of the names of those fields of TaskConfig that the start of an episode depends on."""
@@ -177,20 +192,26 @@ class Locomotion:
         threads: int = 0,
         physics_options: dict | None = None,
     ):
-        robots = [robots] if isinstance(robots, Robot | str) else list(robots)
-        robots = [require_robot(robot) for robot in robots]
-        if engine not in ("auto", "native", "mjx"):
-            raise ValueError(f"engine is {engine!r}; expected 'auto', 'native' or 'mjx'")
+        several = isinstance(robots, list | tuple)
+        robots = [require_robot(robot) for robot in (robots if several else [robots])]
+        require_engine("engine", engine)
         if not robots:
             raise ValueError("robots is empty; expected at least one robot")
-        num_envs = require_integer("num_envs", num_envs, 1)
+        num_envs = require_integer("num_envs", num_envs, 1, MOST_ENVIRONMENTS)
         if num_envs < len(robots):
             raise ValueError(f"num_envs is {num_envs}; {len(robots)} robots need at least as many")
+        config = TaskConfig() if config is None else config
+        require_kind("config", config, TaskConfig, "shapebody.TaskConfig(...)")
+        sizes = Sizes.of(*robots) if sizes is None else sizes
+        require_kind("sizes", sizes, Sizes, "Sizes.of(*robots)")
+        require_flag("auto_reset", auto_reset)
+        require_integer("threads", threads, 0, 4096)
+        options = {} if physics_options is None else physics_options
+        require_kind("physics_options", options, dict, "of arguments of the engine, by name")
         if engine == "auto":
             engine = "native" if jax.default_backend() == "cpu" else "mjx"
         self.robots, self.num_envs, self.engine = tuple(robots), num_envs, engine
-        self.config = config or TaskConfig()
-        self.sizes = sizes or Sizes.of(*robots)
+        self.config, self.sizes = config, sizes
         self.auto_reset = auto_reset
         self.design_dim = max(robot.design_dim for robot in robots)
         bounds = np.linspace(0, num_envs, len(robots) + 1).astype(int)
@@ -198,15 +219,16 @@ class Locomotion:
             _Group(robot, self.sizes, first, last - first, self.config, self.design_dim)
             for robot, first, last in zip(robots, bounds[:-1], bounds[1:], strict=True)
         ]
-        options = dict(physics_options or {})
         if engine == "native":
             from shapebody.physics.native import NativePhysics
 
+            _require_options(options, NativePhysics)
             for group in self.groups:
                 group.physics = NativePhysics(group.robot, group.count, threads=threads, **options)
         else:
             from shapebody.physics.mjx import MjxPhysics
 
+            _require_options(options, MjxPhysics)
             for group in self.groups:
                 group.physics = MjxPhysics(group.robot, group.count, **options)
         self._account = jax.jit(self._moving_part)
@@ -262,9 +284,12 @@ class Locomotion:
                 coefficient outside [0, 1].
         """
         n = self.num_envs
-        if not 0 <= coefficient <= 1:
-            raise ValueError(f"coefficient is {coefficient!r}; expected a number in [0, 1]")
-        if keys is None:
+        require_number("coefficient", coefficient, 0, 1)
+        require_flag("spread", spread)
+        require_key("key", key)
+        if keys is not None:
+            require_key("keys", keys, (n,))
+        else:
             keys = jax.random.split(key, n)
         coefficients = jnp.full(n, coefficient, jnp.float32)
         streaks = jnp.zeros(n, jnp.int32)
@@ -301,7 +326,8 @@ class Locomotion:
         Raises:
             ValueError: for designs of another shape, outside [-1, 1] or not finite.
         """
-        group = self.groups[robot]
+        last = len(self.groups) - 1
+        group = self.groups[require_integer("robot (its number in this batch)", robot, 0, last)]
         designs = group.space.validate(designs)
         if designs.ndim != 2 or len(designs) == 0:
             raise ValueError(
@@ -315,7 +341,8 @@ class Locomotion:
 
         D is the largest robot's; numbers beyond a robot's own d are padding and may be anything.
         """
-        designs, dim = np.asarray(designs, np.float32), self.design_dim
+        dim = self.design_dim
+        designs = require_array("designs", designs, finite=False).astype(np.float32)
         if designs.shape not in ((dim,), (1, dim), (count, dim)):
             raise ValueError(
                 f"designs have shape {designs.shape}; expected one design [{dim}] or one per "
@@ -356,6 +383,7 @@ class Locomotion:
         Raises:
             ValueError: if a setting differs that the start of an episode depends on.
         """
+        require_kind("config", config, TaskConfig, "shapebody.TaskConfig(...)")
         for name in vars(config):
             old, new = getattr(self.config, name), getattr(config, name)
             if name.startswith(START_SETTINGS) and old != new:
@@ -411,7 +439,25 @@ class Locomotion:
         Raises:
             ValueError: for designs of another shape, outside [-1, 1] or not finite.
         """
-        rows, keys = np.asarray(rows), np.asarray(keys)
+        require_kind("state", state, Episode, "what reset, step or rollout returned")
+        rows = require_array("rows", rows, kinds="iu")
+        if rows.ndim != 1:
+            raise refuse("rows", rows, "a list of numbers of environments")
+        if rows.size and (rows.min() < 0 or rows.max() >= self.num_envs):
+            raise ValueError(
+                f"rows reach from {rows.min()} to {rows.max()}; expected numbers of environments, "
+                f"0 to {self.num_envs - 1}"
+            )
+        keys = np.asarray(require_key("keys", keys, rows.shape))
+        for name, value, kinds, low, high in (
+            ("coefficient", coefficient, "fiu", 0, 1),
+            ("streak", streak, "iu", -(2**31), 2**31 - 1),
+        ):
+            values = require_array(name, value, kinds=kinds)
+            right = values.shape in ((), rows.shape) and np.all((values >= low) & (values <= high))
+            if not right:
+                expected = f"one number from {low} to {high}, or one for each of rows"
+                raise refuse(name, value, expected)
         if designs is not None:
             designs = self._validated(designs, len(rows), rows)
         coefficient = np.broadcast_to(np.asarray(coefficient, np.float32), rows.shape)
@@ -448,6 +494,8 @@ class Locomotion:
         Returns:
             The new state and the Trajectory.
         """
+        self._check_call(policy, state, key)
+        require_integer("length", length, 1, 1_000_000)
         if self.engine == "mjx":
             return self._rollout_mjx(policy, params, state, key, length)
         first = state.descriptions
@@ -464,6 +512,9 @@ class Locomotion:
         Where `running` ([N] bool, all if None) is False the body is not simulated, which saves
         time, and what is returned about that environment means nothing.
         """
+        self._check_call(policy, state, key)
+        if running is not None:
+            running = require_array("running", running, (self.num_envs,), kinds="b")
         act = self._compiled(policy)
         moved, targets, observation, action, extra = act(params, state, key)
         target, trunk, velocity = map(np.asarray, targets)
@@ -488,6 +539,11 @@ class Locomotion:
             coefficient, streak, keys = (np.asarray(x)[rows] for x in following)
             state = self.restart(state, rows, keys, None, coefficient, streak)
         return state, record, outcome
+
+    def _check_call(self, policy, state, key) -> None:
+        require_function("policy", policy)
+        require_kind("state", state, Episode, "what reset, step or rollout returned")
+        require_key("key", key)
 
     def _compiled(self, policy: Policy):
         if policy not in self._steps:
@@ -590,11 +646,29 @@ class Locomotion:
 
     def restore(self, state: Episode, arrays: list[dict[str, np.ndarray]]) -> None:
         """Continue from a saved `state` and its `physics_arrays` (native engine)."""
+        require_kind("state", state, Episode, "what reset, step or rollout returned")
+        arrays = require_list("arrays", arrays)
+        if len(arrays) != len(self.groups):
+            raise ValueError(
+                f"arrays has {len(arrays)} entries; expected one per robot, {len(self.groups)}: "
+                "what physics_arrays returned"
+            )
+        for saved in arrays:
+            require_kind("an entry of arrays", saved, dict, "what physics_arrays returned")
         designs = np.asarray(state.design)
         for group, saved in zip(self.groups, arrays, strict=True):
             _, embodiments = self._bodies(group, designs[group.slice, : group.space.dim])
             group.physics.set_designs(np.arange(group.count), embodiments)
             group.physics.restore(saved)
+
+
+def _require_options(options: dict, engine) -> None:
+    """ValueError if an engine's constructor does not take these."""
+    given = ("robot", "num_envs", "threads")
+    known = [name for name in inspect.signature(engine).parameters if name not in given]
+    for name in options:
+        if name not in known:
+            raise refuse("a key of physics_options", name, f"one of {', '.join(known)}")
 
 
 def _record(state: Episode, observation, action, extra, outcome: Outcome) -> StepRecord:

@@ -22,6 +22,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
+from shapebody.checks import require_shape
 from shapebody.descriptions import Descriptions
 from shapebody.locomotion.config import CONTROL_STEP
 from shapebody.locomotion.readings import Readings
@@ -212,6 +213,7 @@ def combine(terms: jax.Array, coefficient: jax.Array) -> jax.Array:
     max(w1 T1 + w2 T2 + c (w3 T3 + w5 T5 + ... + w23 T23), 0) + c w4 T4, with every weight
     multiplied by the control step.
     """
+    require_shape("terms", terms, ("...", len(TERMS)))
     weighted = terms * jnp.array([term.weight * CONTROL_STEP for term in TERMS])
     rest = weighted[..., 2] + jnp.sum(weighted[..., 4:], -1)
     clipped = jax.nn.relu(weighted[..., 0] + weighted[..., 1] + coefficient * rest)

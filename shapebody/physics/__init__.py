@@ -19,11 +19,14 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import mujoco
 import numpy as np
 
+from shapebody.checks import require_integer
+
 if TYPE_CHECKING:
     from shapebody.robots import Robot
 
 __all__ = ["MAX_VALUE", "MjxPhysics", "NativePhysics", "Readings", "home_sensordata", "prepare"]
 
+MOST_SIMULATIONS, MOST_SUBSTEPS = 2**20, 10_000
 MAX_VALUE = 1e10
 """Largest magnitude of a position, velocity or acceleration that MuJoCo takes for a valid one."""
 
@@ -62,7 +65,9 @@ def prepare(
     Raises:
       ValueError: a body whose mass matrix the compiler fixed to be diagonal.
     """
-    model = copy.copy(robot.model)
+    from shapebody.robots import require_robot
+
+    model = copy.copy(require_robot(robot).model)
     if model.dof_simplenum.any():
         body = mujoco.mj_id2name(
             model, mujoco.mjtObj.mjOBJ_BODY, model.dof_bodyid[model.dof_simplenum.argmax()]
@@ -82,9 +87,9 @@ def prepare(
         flags[:] = np.where(with_body, same.mjSAMEFRAME_BODYROT, same.mjSAMEFRAME_NONE)
     model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
     if solver_iterations is not None:
-        model.opt.iterations = _at_least_one("solver_iterations", solver_iterations)
+        model.opt.iterations = require_integer("solver_iterations", solver_iterations, 1, 10_000)
     if line_search is not None:
-        model.opt.ls_iterations = _at_least_one("line_search", line_search)
+        model.opt.ls_iterations = require_integer("line_search", line_search, 1, 10_000)
     return model
 
 
@@ -95,12 +100,6 @@ def home_sensordata(robot: Robot, model: mujoco.MjModel) -> np.ndarray:
     data.ctrl[:] = robot.nominal
     mujoco.mj_forward(model, data)
     return data.sensordata.copy()
-
-
-def _at_least_one(name: str, value: int) -> int:
-    if value != int(value) or value < 1:
-        raise ValueError(f"{name} is {value!r}; it must be an integer of at least 1")
-    return int(value)
 
 
 def __getattr__(name: str) -> Any:

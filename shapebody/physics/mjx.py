@@ -19,15 +19,21 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
-from shapebody.design import MODEL_FIELDS
-from shapebody.physics import MAX_VALUE, _at_least_one, home_sensordata, prepare
+from shapebody.checks import (
+    require_array,
+    require_choice,
+    require_integer,
+    require_kind,
+    require_shape,
+)
+from shapebody.design import MODEL_FIELDS, Embodiment
+from shapebody.physics import MAX_VALUE, MOST_SIMULATIONS, MOST_SUBSTEPS, home_sensordata, prepare
 
 with contextlib.redirect_stdout(io.StringIO()):  # It prints that the optional Warp is missing.
     from mujoco import mjx
     from mujoco.mjx._src import collision_driver, math
 
 if TYPE_CHECKING:
-    from shapebody.design import Embodiment
     from shapebody.robots import Robot
 
 # MJX decides once, for all designs, which joints have dry friction, and its solver locks such a
@@ -83,8 +89,8 @@ class MjxPhysics:
     ):
         _check_implementation(impl)
         self.robot = robot
-        self.num_envs = _at_least_one("num_envs", num_envs)
-        self.substeps = _at_least_one("substeps", substeps)
+        self.num_envs = require_integer("num_envs", num_envs, 1, MOST_SIMULATIONS)
+        self.substeps = require_integer("substeps", substeps, 1, MOST_SUBSTEPS)
         model = prepare(robot, solver_iterations, line_search)
         # MJX has no automatic reset, and Warp refuses the flag that switches it off.
         model.opt.disableflags &= ~int(mujoco.mjtDisableBit.mjDSBL_AUTORESET)
@@ -113,9 +119,11 @@ class MjxPhysics:
         Raises:
           ValueError: a field or an array of another shape.
         """
+        require_kind("embodiments", embodiments, Embodiment, "space(designs)")
         design = {}
         for name in MODEL_FIELDS:
-            value = jnp.asarray(getattr(embodiments, name))
+            value = require_shape(f"embodiments.{name}", getattr(embodiments, name), None)
+            value = jnp.asarray(value)
             expected = (self.num_envs, *getattr(self.model, name).shape)
             if value.shape != expected:
                 raise ValueError(
@@ -146,6 +154,9 @@ class MjxPhysics:
 
         The values given for the other simulations are computed with but not used.
         """
+        _require_state(state)
+        if not isinstance(mask, jax.Array):
+            mask = require_array("mask", mask, kinds="b")
         mask = jnp.asarray(mask)
         if mask.shape != (self.num_envs,) or mask.dtype != bool:
             raise ValueError(
@@ -156,10 +167,12 @@ class MjxPhysics:
 
     def velocity(self, state: PhysicsState) -> jax.Array:
         """Generalized velocities (N, nv)."""
+        _require_state(state)
         return state.qvel
 
     def with_velocity(self, state: PhysicsState, qvel: jax.Array) -> PhysicsState:
         """The state with other generalized velocities (N, nv)."""
+        _require_state(state)
         return dataclasses.replace(state, qvel=self._broadcast("qvel", qvel, self.model.nv))
 
     def step(
@@ -178,7 +191,8 @@ class MjxPhysics:
         Raises:
           ValueError: ctrl of another shape.
         """
-        if ctrl.shape != (self.num_envs, self.model.nu):
+        _require_state(state)
+        if require_shape("ctrl", ctrl, None).shape != (self.num_envs, self.model.nu):
             raise ValueError(
                 f"ctrl has shape {ctrl.shape}; {self.num_envs} simulations of {self.robot.name} "
                 f"need {(self.num_envs, self.model.nu)}"
@@ -216,6 +230,8 @@ class MjxPhysics:
         return carry
 
     def _broadcast(self, name: str, value: jax.Array, size: int) -> jax.Array:
+        if not isinstance(value, jax.Array):
+            value = require_array(name, value, finite=False)
         value = jnp.asarray(value, self._mjx_data.qpos.dtype)
         if value.shape not in ((self.num_envs, size), (size,)):
             raise ValueError(
@@ -271,9 +287,12 @@ def _where(mask: jax.Array, new: Any, old: Any) -> Any:
     return jax.tree.map(choose, new, old)
 
 
+def _require_state(state) -> None:
+    require_kind("state", state, PhysicsState, "what init, reset or step returned")
+
+
 def _check_implementation(impl: str) -> None:
-    if impl not in ("jax", "warp"):
-        raise ValueError(f"impl is {impl!r}; it must be 'jax' or 'warp'")
+    require_choice("impl", impl, ("jax", "warp"))
     if impl == "jax":
         return
     import mujoco.mjx.warp as mjx_warp

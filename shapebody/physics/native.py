@@ -12,11 +12,23 @@ import mujoco
 import numpy as np
 from mujoco.batch import Batch, SimulationError
 
-from shapebody.design import MODEL_FIELDS
-from shapebody.physics import MAX_VALUE, Readings, _at_least_one, home_sensordata, prepare
+from shapebody.checks import (
+    require_array,
+    require_flag,
+    require_integer,
+    require_kind,
+)
+from shapebody.design import MODEL_FIELDS, Embodiment
+from shapebody.physics import (
+    MAX_VALUE,
+    MOST_SIMULATIONS,
+    MOST_SUBSTEPS,
+    Readings,
+    home_sensordata,
+    prepare,
+)
 
 if TYPE_CHECKING:
-    from shapebody.design import Embodiment
     from shapebody.robots import Robot
 
 # In place of each of these, MuJoCo would reset the simulation or, for the last, drop the control.
@@ -65,11 +77,11 @@ class NativePhysics:
         line_search: int | None = None,
         recompute_constants: bool = False,
     ):
-        if threads != int(threads) or threads < 0:
-            raise ValueError(f"threads is {threads!r}; it must be 0 (all CPUs) or positive")
+        require_integer("threads (0: one per CPU)", threads, 0, 4096)
+        require_flag("recompute_constants", recompute_constants)
         self.robot = robot
-        self.num_envs = _at_least_one("num_envs", num_envs)
-        self.substeps = _at_least_one("substeps", substeps)
+        self.num_envs = require_integer("num_envs", num_envs, 1, MOST_SIMULATIONS)
+        self.substeps = require_integer("substeps", substeps, 1, MOST_SUBSTEPS)
         self.recompute_constants = recompute_constants
         self.model = prepare(robot, solver_iterations, line_search)
         self._home_sensordata = home_sensordata(robot, self.model)
@@ -100,9 +112,10 @@ class NativePhysics:
           ValueError: ids out of range, or a field of another shape.
         """
         ids = self._ids(ids)
+        require_kind("embodiments", embodiments, Embodiment, "space(designs)")
         values = {}
         for name, field in self._fields.items():
-            value = np.asarray(getattr(embodiments, name))
+            value = require_array(f"embodiments.{name}", getattr(embodiments, name), finite=False)
             if value.shape != (len(ids), *field.shape[1:]):
                 raise ValueError(
                     f"embodiments.{name} has shape {value.shape}; {len(ids)} designs of "
@@ -158,10 +171,7 @@ class NativePhysics:
         """
         ids = None  # all
         if running is not None:
-            if np.shape(running) != (self.num_envs,):
-                raise ValueError(
-                    f"running has shape {np.shape(running)}; expected ({self.num_envs},)"
-                )
+            running = require_array("running", running, (self.num_envs,), kinds="b")
             ids = np.flatnonzero(running)
         self._write("ctrl", self._ctrl, ctrl)
         if qpos is not None:
@@ -187,7 +197,7 @@ class NativePhysics:
 
     def get_model(self, env: int) -> mujoco.MjModel:
         """A copy of the model that simulation `env` runs, with its design."""
-        return self._batch.get_model(int(self._ids([env])[0]))
+        return self._batch.get_model(int(self._ids([require_integer("env", env)])[0]))
 
     def state(self) -> dict[str, np.ndarray]:
         """Copies of all arrays from which `restore` resumes exactly.
@@ -203,10 +213,11 @@ class NativePhysics:
         Raises:
           ValueError: a missing array, or one of another shape.
         """
+        require_kind("state", state, Mapping, "what state() returned")
         missing = [name for name in _STATE if name not in state]
         if missing:
             raise ValueError(f"the state lacks {', '.join(missing)}; use what state() returned")
-        arrays = {name: np.asarray(state[name]) for name in _STATE}
+        arrays = {name: require_array(name, state[name], finite=False) for name in _STATE}
         for name, array in arrays.items():
             live = self._batch.bind(name)
             if array.shape != live.shape:
@@ -223,7 +234,7 @@ class NativePhysics:
         return np.logical_and(*((np.abs(x) <= MAX_VALUE).all(1) for x in state))
 
     def _ids(self, ids: np.ndarray) -> np.ndarray:
-        ids = np.asarray(ids)
+        ids = require_array("ids", ids)
         if ids.ndim != 1 or (ids.size and ids.dtype.kind not in "iu"):
             raise ValueError(
                 f"ids has shape {ids.shape} and type {ids.dtype}; it must be a vector of integers "
@@ -237,7 +248,7 @@ class NativePhysics:
         return ids.astype(np.int64, copy=False)
 
     def _write(self, name: str, live: np.ndarray, value: np.ndarray) -> None:
-        value = np.asarray(value)
+        value = require_array(name, value, finite=False)
         if value.shape != live.shape:
             raise ValueError(
                 f"{name} has shape {value.shape}; {self.num_envs} simulations of "
@@ -246,7 +257,7 @@ class NativePhysics:
         live[...] = value
 
     def _broadcast(self, name: str, value: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
-        value = np.asarray(value)
+        value = require_array(name, value, finite=False)
         if value.shape not in (shape, shape[1:]):
             raise ValueError(
                 f"{name} has shape {value.shape}; {self.robot.name} needs {shape} or {shape[1:]}"

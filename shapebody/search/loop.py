@@ -12,7 +12,17 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from shapebody.checks import require_integer
+from shapebody.checks import (
+    refuse,
+    require_array,
+    require_integer,
+    require_key,
+    require_kind,
+    require_number,
+)
+
+MOST = 1_000_000
+"""Largest number of iterations, candidates and the like."""
 
 
 class Search(NamedTuple):
@@ -55,6 +65,10 @@ def iterate(objective, starts, key, config, steps: Steps, evaluations: int) -> S
     its result does not depend on the other starts, to the last bit: each is searched by the same
     program, on a CPU as many at a time as there are cores.
     """
+    starts = require_array("starts", starts, ("S", "d"))
+    require_key("key", key)
+    require_kind("steps", steps, Steps, "three functions of the method, see there")
+    require_integer("evaluations", evaluations)
     starts = jnp.asarray(starts)
     # Compiled here, once; threads that meet an uncompiled function would each compile it.
     run = _run.lower(objective, starts[0], key, config, steps).compile()
@@ -141,16 +155,17 @@ def require(config, expected: str, valid: Callable[[float], bool], *names: str) 
     """ValueError naming the first of the settings `names` of `config` that is not `valid`."""
     for name in names:
         value = getattr(config, name)
-        if not isinstance(value, numbers.Real) or not valid(value):
-            raise ValueError(f"{name} is {value!r}; expected {expected}")
+        if isinstance(value, bool) or not isinstance(value, numbers.Real) or not valid(value):
+            raise refuse(name, value, expected)
 
 
 def require_integers(config, *names: str, least: int = 1) -> None:
     """ValueError naming the first setting of `names` that is no integer of at least `least`."""
     for name in names:
-        require_integer(name, getattr(config, name), least)
+        require_integer(name, getattr(config, name), least, MOST)
 
 
 def require_positive(config, *names: str) -> None:
     """ValueError naming the first of the settings `names` that is not positive and finite."""
-    require(config, "a positive number", lambda x: 0 < x < float("inf"), *names)
+    for name in names:
+        require_number(name, getattr(config, name), above=0)

@@ -24,7 +24,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from shapebody.checkpoints import Agent
-from shapebody.checks import require_integer
+from shapebody.checks import require_seed, shown
 from shapebody.locomotion.observations import Observation
 from shapebody.robots import Robot
 from shapebody.search.bayesian import BOConfig, bo
@@ -131,7 +131,7 @@ def search(
         ImportError: for "bo" without PyTorch and BoTorch.
     """
     function, config = _method(method, settings)
-    require_integer("seed", seed)
+    require_seed("seed", seed)
     objective = Objective.of(agent, robot, trust_region, reference, states, batch_size, frozen)
     starts = objective.values.space.validate(f)
     if starts.ndim > 2 or len(starts) == 0:
@@ -206,10 +206,10 @@ _compilation = _Compilation()
 
 
 def _method(name: str, settings: dict):
-    if name not in METHODS:
-        close = difflib.get_close_matches(str(name), METHODS, n=1)
+    if not isinstance(name, str) or name not in METHODS:
+        close = difflib.get_close_matches(str(name)[:100], METHODS, n=1)
         hint = f"; did you mean {close[0]!r}?" if close else "."
-        raise ValueError(f"there is no method {name!r}{hint} Methods: {', '.join(METHODS)}")
+        raise ValueError(f"there is no method {shown(name)}{hint} Methods: {', '.join(METHODS)}")
     function, kind = METHODS[name]
     known = [field.name for field in dataclasses.fields(kind)]
     unknown = [setting for setting in settings if setting not in known]

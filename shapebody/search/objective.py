@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import numbers
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any
@@ -13,13 +12,21 @@ import jax.numpy as jnp
 import numpy as np
 
 from shapebody.checkpoints import Agent, require_agent
-from shapebody.checks import require_integer
+from shapebody.checks import (
+    require_integer,
+    require_key,
+    require_kind,
+    require_number,
+    require_shape,
+)
 from shapebody.descriptions import Descriptions, Sizes, describe
 from shapebody.design import DesignSpace
 from shapebody.locomotion.observations import Observation
-from shapebody.networks import Critic, CriticConfig
+from shapebody.networks import GENERAL, PRIVILEGED, Critic, CriticConfig
 from shapebody.robots import Robot, require_robot
 
+LARGEST_LAMBDA = 1e30
+"""Penalties of larger coefficients would leave single precision."""
 MAX_ROWS = 8192
 """Most (design, state) pairs that the critic sees at once (a state for every design at least)."""
 
@@ -51,6 +58,8 @@ _critics: dict[Any, DesignCritic] = {}
 
 def design_critic(robot: Robot, config: CriticConfig) -> DesignCritic:
     """The `DesignCritic` of a robot and a critic's configuration, built once."""
+    require_robot(robot)
+    require_kind("config", config, CriticConfig, "shapebody.CriticConfig(...)")
     key = (robot.path, robot.xml, config)
     if key not in _critics:
         # Padding has no influence, so the robot's own sizes do, and are the fastest.
@@ -115,11 +124,8 @@ class Objective:
                 robot.
         """
         require_agent(agent)
-        if not (isinstance(trust_region, numbers.Real) and 0 <= trust_region < np.inf):
-            raise ValueError(
-                f"trust_region is {trust_region!r}; expected a finite number of at least 0 "
-                "(the penalty coefficient, 100 in the paper)"
-            )
+        hint = "the penalty coefficient, 100 in the paper"
+        require_number("trust_region", trust_region, 0, LARGEST_LAMBDA, hint=hint)
         require_integer("batch_size", batch_size, 1)
         require_robot(robot)
         values = design_critic(robot, agent.critic_config)
@@ -152,19 +158,20 @@ class Objective:
 
     def hold(self, designs):
         """Designs [..., d] with the frozen entries at f_ref."""
-        return jnp.where(self.free, jnp.asarray(designs, jnp.float32), self.reference)
+        return jnp.where(self.free, self.values.space._float32(designs, jnp), self.reference)
 
     def batch(self, key) -> Observation:
         """A minibatch of states, drawn without replacement; the whole bank if it is smaller."""
         if self.num_states <= self.batch_size:
             return self.states
+        require_key("key", key)
         chosen = jax.random.choice(key, self.num_states, (self.batch_size,), replace=False)
         return jax.tree.map(lambda x: x[chosen], self.states)
 
     def value(self, designs, states: Observation | None = None):
         """Mean of V̄ over `states` (the whole bank if not given) for designs [..., d] -> [...]."""
         designs = self.hold(designs)
-        states = self.states if states is None else states
+        states = self.states if states is None else trim(states, self.values.space.robot)
         rows = designs.reshape(-1, designs.shape[-1])
         return _mean_value(self, rows, states).reshape(designs.shape[:-1])
 
@@ -215,6 +222,8 @@ def bank(agent: Agent, robot: Robot) -> Observation:
     Raises:
         ValueError: if no state fits.
     """
+    require_agent(agent)
+    require_robot(robot)
     if agent.states is None:
         raise ValueError(
             f"agent {agent.name!r} has no state bank; give states=, observations from rollouts of "
@@ -243,14 +252,19 @@ def bank(agent: Agent, robot: Robot) -> Observation:
 
 def trim(states: Observation, robot: Robot) -> Observation:
     """States [M, ...] cut to the joints and feet of `robot`; ValueError if they have fewer."""
+    require_kind("states", states, Observation, "observations such as agent.states")
     own = Sizes.of(robot)
+    for name, columns in (("general", GENERAL), ("privileged", PRIVILEGED)):
+        require_shape(f"states.{name}", getattr(states, name), ("M", columns))
     for name, needed in (("joints", own.joints), ("feet", own.feet)):
-        shape = np.shape(getattr(states, name))
+        shape = require_shape(f"states.{name}", getattr(states, name), None).shape
         if len(shape) != 3 or shape[0] == 0 or shape[1] < needed:
             raise ValueError(
                 f"states.{name} has shape {shape}; robot {robot.name!r} needs at least one state "
                 f"with {needed} {name}: [M, {needed} or more, ...]"
             )
+    if (states.joints.shape[1], states.feet.shape[1]) == (own.joints, own.feet):
+        return states
     return dataclasses.replace(
         states, joints=states.joints[:, : own.joints], feet=states.feet[:, : own.feet]
     )

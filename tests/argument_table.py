@@ -1,0 +1,968 @@
+"""The kinds of all parameters of all public functions, for test_arguments.py.
+
+`FUNCTIONS` has an entry per public function, class and method; `UNCHECKED` those that are called
+with what others have looked at, with the reason; `INTERNAL` the modules that are no interface. A
+new public function without an entry fails the test.
+"""
+
+import numpy as np
+from arguments import (
+    AGENT,
+    AGENT_FOLDER,
+    ANGLE,
+    ANSWER,
+    AXES,
+    CONFIDENCE,
+    COUNT,
+    DESIGN,
+    ENGINE,
+    FLAG,
+    FOLDER,
+    FPS,
+    FRAMES,
+    FUNCTION,
+    HEIGHT,
+    KEY,
+    MODEL,
+    NAME,
+    OUTPUT,
+    QPOS,
+    RECORDS,
+    ROBOT,
+    ROBOT_FILE,
+    ROBOT_NAME,
+    RUNS,
+    SEED,
+    SPACE,
+    STEPS,
+    TASK,
+    TEXT,
+    TRUST_REGION,
+    WRONG,
+    array,
+    choice,
+    config,
+    integer,
+    labels,
+    number,
+    optional,
+    thing,
+)
+
+INTERNAL = {
+    "checks": "the checks themselves: every test here is one of them",
+    "drawing": "draws models that `video` has looked at",
+    "feet": "reads compiled models, for `robots` and `inference`",
+    "inference": "completes compiled models, for `robots`",
+    "locomotion.curriculum": "formulas inside compiled code, called by `locomotion.env`",
+    "locomotion.episode": "one episode inside compiled code, called by `locomotion.env`",
+    "locomotion.observations": "formulas inside compiled code, called by `locomotion.env`",
+    "locomotion.randomization": "formulas inside compiled code, called by `locomotion.env`",
+    "locomotion.readings": "formulas inside compiled code, called by `locomotion.env`",
+    "mjcf": "writes embodiments of `design`, which has looked at the design",
+    "parameters": "tables of a robot, called by `design`",
+    "reading": "reads files that `robots.find` has found",
+    "specs": "edits MuJoCo's specifications, for `inference`",
+}
+
+RESULT = "a result: the package makes it, no user does"
+FORMULA = "a formula inside compiled code, where values cannot be looked at"
+INSIDE = "called through a network's `apply`, which looks at the inputs"
+METHOD = "called by `search`, which has looked at everything"
+ON_MODEL = "one of the checks of a compiled model, called by `robots.examine`"
+UNCHECKED = {
+    "checkpoints.Agent": "looked at by `check_agent`, which saving and loading call",
+    "descriptions.Descriptions": RESULT,
+    "descriptions.Frames": RESULT,
+    "design.Embodiment": RESULT,
+    "design.quaternion_product": FORMULA,
+    "evaluation.Evaluation": RESULT,
+    "evaluation.Gain": RESULT,
+    "experiments.Budget": "a row of BUDGETS",
+    "locomotion.env.StepRecord": RESULT,
+    "locomotion.env.Trajectory": RESULT,
+    "locomotion.rewards.Moment": RESULT,
+    "locomotion.rewards.Term": "a row of TERMS",
+    "locomotion.rewards.reward_terms": FORMULA,
+    "networks.Core": INSIDE,
+    "networks.Critic.act": INSIDE,
+    "networks.Critic.embed": INSIDE,
+    "networks.Critic.value": INSIDE,
+    "networks.PartEncoder": INSIDE,
+    "networks.PartEncoder.embed": INSIDE,
+    "networks.Policy.act": INSIDE,
+    "networks.Policy.embed": INSIDE,
+    "networks.WeightNormDense": INSIDE,
+    "networks.aggregate": FORMULA,
+    "networks.elu": FORMULA,
+    "networks.entropy": FORMULA,
+    "networks.log_prob": FORMULA,
+    "networks.require_inputs": "a check itself, called by `Agent.act` and `Agent.values`",
+    "physics.Readings": RESULT,
+    "physics.home_sensordata": "called by the engines with the model of `prepare`",
+    "physics.mjx.PhysicsState": RESULT,
+    "ppo.Learner": RESULT,
+    "ppo.Trainer.agent": "takes what `state_bank` returned",
+    "ppo.command_changes": FORMULA,
+    "recording.Recording": RESULT,
+    "robots.Robot": RESULT,
+    "robots.examine": "takes a path of `find`",
+    "robots.tilt": "takes the keyframe of a compiled model",
+    "search.loop.Scored": RESULT,
+    "search.loop.Search": RESULT,
+    "search.loop.Steps": "a method of one's own: what it does is up to its functions",
+    "search.loop.last_finite": METHOD,
+    "search.loop.require": "a check itself, called by the methods' configurations",
+    "search.loop.require_integers": "a check itself, called by the methods' configurations",
+    "search.loop.require_positive": "a check itself, called by the methods' configurations",
+    "search.loop.score": METHOD,
+    "search.loop.start_key": METHOD,
+    "search.loop.values_and_gradients": METHOD,
+    "search.methods.Method": "a row of METHODS",
+    "search.methods.SearchResult": RESULT,
+    "search.objective.DesignCritic": "made by `design_critic`",
+    "search.objective.DesignCritic.__call__": "called by `Objective`, inside compiled code",
+    "search.objective.Objective": "made by `Objective.of`",
+    "validation.Held": RESULT,
+    "validation.Report": RESULT,
+    "notebooks.main": "the command line, see the other test",
+}
+UNCHECKED |= dict.fromkeys(
+    (
+        f"robots.check_{name}"
+        for name in "actuators custom feet home joints loops masses numbers spheres tree".split()
+    ),
+    ON_MODEL,
+)
+UNCHECKED |= dict.fromkeys(
+    (f"validation.warn_{x}" for x in "feet limits plausibility standing torque".split()),
+    "one of the checks of a robot, called by `validate_robot`",
+)
+UNCHECKED |= dict.fromkeys(
+    (
+        "search.bayesian.bo search.directions.ars search.evolution.cma_es search.particles.gc_pfo "
+        "search.populations.cem search.populations.de search.populations.pso "
+        "search.sampling.random search.sampling.turbo search.vgds.penalty_only search.vgds.vgds"
+    ).split(),
+    METHOD,
+)
+UNCHECKED |= dict.fromkeys(
+    (
+        f"locomotion.rewards.{name}"
+        for name in (
+            "action_rate action_smoothness alive base_height foot_air_time foot_slip "
+            "foot_z_velocity imu_acceleration joint_acceleration joint_nominal_deviation "
+            "joint_position_limit joint_torque joint_velocity joint_velocity_limit positive_power "
+            "roll_pitch_position roll_pitch_velocity self_collision symmetric_air "
+            "xy_velocity_tracking yaw_velocity_tracking z_velocity"
+        ).split()
+    ),
+    FORMULA,
+)
+
+EVALUATED = dict(episodes=integer(1, 10**6), horizon=integer(1, 10**6), seed=SEED)
+STUDY = dict(
+    agent=AGENT,
+    robot=ROBOT,
+    runs=RUNS,
+    starts=integer(1, 10**6),
+    episodes=integer(1, 10**6),
+    horizon=integer(1, 10**6),
+    seed=integer(0, 10**6, 0),
+    iterations=optional(integer(1, 10**6)),
+    first_start=integer(0, 10**6, 0),
+    recompute=FLAG,
+)
+CAMERA = dict(azimuth=ANGLE, elevation=ANGLE)
+SIZE = dict(height=HEIGHT, width=HEIGHT)
+DISTANCE = optional(number(1e-300, right=1.0))
+PLAYED = dict(frames=FRAMES, fps=FPS)
+WIDTH = optional(integer(1, 100_000))
+NAMES = optional(thing(lambda world: ["unitree_go2"]))
+SECONDS = optional(number(0))
+RESUMED = dict(folder=optional(FOLDER), progress=FLAG, max_seconds=SECONDS, engine=ENGINE)
+CRITICS = thing(lambda world: {"a": world.agent})
+STATES = optional(thing(lambda world: world.agent.states))
+STATE = thing(lambda world: world.state)
+BODIES = thing(lambda world: world.bodies)
+CALLED = dict(policy=FUNCTION, params=thing(lambda world: {}).also(*WRONG, why="the policy's own"))
+CALLED |= dict(state=STATE, key=KEY)
+DESCRIBED = thing(lambda world: world.descriptions)
+ENTRIES = ("array of NaN", "empty array")
+EMPTY_IDS = ("list", "empty array")
+FINITE = number()
+JSON = choice({})
+FROZEN = thing(lambda world: ("size",)).also("list", "empty array", why="nothing is frozen")
+CONFIG_COUNT = integer(1, 10**6)
+POSITIVE = number(1e-300)
+ITERATIONS = dict(iterations=CONFIG_COUNT)
+STD = dict(initial_std=POSITIVE)
+WIDTHS = array(2, right=(8, 8))
+WIDTH_1 = integer(1, 65536, 4)
+TEMPERATURES = dict(
+    # One has to be above the other.
+    initial_temperature=number(0.03, right=1.0),
+    minimum_temperature=number(0, 0.9, 0.025),
+    latent_scale=POSITIVE,
+)
+PROBABILITY = number(0, 1, 0.5)
+AT_LEAST_0 = number(0)
+
+TASK_FIELDS = dict(
+    horizon=integer(1, 10**400),
+    command_limit=optional(POSITIVE),
+    action_delay=optional(integer(0, 1)),
+    design_radius=array(2, right=(0.0, 1.0)),
+    velocity_bound=optional(POSITIVE),
+    fixed_coefficient=FLAG,
+    curriculum_levels=integer(1, 10**400),
+    curriculum_success=choice("tracking"),
+    curriculum_length=integer(1, 10**400),
+)
+TASK_FIELDS |= dict.fromkeys(
+    "command_change command_all_zero command_single_zero delay_probability mixed_delay "
+    "push_probability push_add".split(),
+    PROBABILITY,
+)
+TASK_FIELDS |= dict.fromkeys(
+    "command_dead_zone noise_joint_position noise_joint_velocity noise_angular_velocity "
+    "noise_gravity initial_yaw initial_tilt initial_joint_factor initial_joint_offset "
+    "push_per_mass push_limit termination_height curriculum_error curriculum_return".split(),
+    AT_LEAST_0,
+)
+
+FUNCTIONS = {
+    "advice.large_changes": dict(space=SPACE, f=DESIGN, limit=AT_LEAST_0),
+    "advice.objections": dict(
+        walked=thing(lambda world: world.evaluation),
+        stood=thing(lambda world: world.evaluation),
+        row=integer(0, 1),
+        reference=integer(0, 1),
+    ),
+    "catalog.gallery": dict(names=NAMES, rows=integer(1, 1000), **SIZE),
+    "catalog.group_scene": dict(names=NAMES, rows=integer(1, 1000)),
+    "catalog.random_bodies": dict(
+        robot=ROBOT, designs=integer(1, 10**5), control_steps=integer(1, 10**6), seed=SEED
+    ),
+    "catalog.robot_table": dict(names=NAMES),
+    "checkpoints.Agent.act": dict(
+        descriptions=DESCRIBED, observation=thing(lambda world: world.observation)
+    ),
+    "checkpoints.Agent.values": dict(
+        descriptions=DESCRIBED, observation=thing(lambda world: world.observation)
+    ),
+    "checkpoints.agent_folder": dict(
+        name_or_folder=AGENT_FOLDER.also("Path ..", why="a folder; load_agent looks into it")
+    ),
+    "checkpoints.agents": {},
+    "checkpoints.check_agent": dict(agent=AGENT),
+    "checkpoints.chosen_folder": dict(folder=optional(FOLDER).given(None), name=NAME),
+    "checkpoints.load_agent": dict(name_or_folder=AGENT_FOLDER),
+    "checkpoints.load_curve": dict(name_or_folder=AGENT_FOLDER),
+    "checkpoints.provenance": {},
+    "checkpoints.require_agent": dict(agent=AGENT),
+    "checkpoints.save_agent": dict(
+        agent=AGENT,
+        folder=optional(FOLDER),
+        curve=optional(thing(lambda world: [])).also(
+            "list", "empty array", why="a curve without rows"
+        ),
+    ),
+    "critics.compare_critics": dict(
+        critics=CRITICS,
+        robot=ROBOT,
+        trust_regions=array(1, right=(20.0,), accepts=("list", "empty array")),
+        starts=integer(1, 10**6),
+        first_start=integer(0, right=0),
+        **EVALUATED,
+    ),
+    "critics.critic_correlations": dict(critics=CRITICS, robot=ROBOT, records=RECORDS),
+    "critics.critic_gains": dict(records=RECORDS),
+    "descriptions.Sizes": dict(
+        joints=integer(1, 10**4), feet=integer(1, 10**4), spheres=integer(0, 10**4)
+    ),
+    "descriptions.Sizes.of": dict(robots=ROBOT),
+    "descriptions.describe": dict(
+        robot=ROBOT, sizes=optional(thing(lambda world: world.agent.sizes))
+    ),
+    "descriptions.kinematics": dict(robot=ROBOT),
+    "descriptions.symmetric_feet": dict(robot=ROBOT),
+    "design.DesignSpace": dict(
+        robot=ROBOT, axes_seed=SEED, published_axes_of=optional(DESIGN).given(None)
+    ),
+    "design.DesignSpace.__call__": dict(f=DESIGN),
+    "design.DesignSpace.frozen": dict(names=FROZEN),
+    "design.DesignSpace.start": dict(
+        seed=integer(0, 2**63, 0).also("2**40", why="a start design has a number, not a seed")
+    ),
+    "design.DesignSpace.to_mjcf": dict(f=DESIGN),
+    "design.DesignSpace.to_model": dict(f=DESIGN),
+    "design.DesignSpace.validate": dict(f=DESIGN),
+    "design.published_axes": dict(robot=ROBOT, f=DESIGN),
+    "design.published_axes_seed": dict(
+        f=DESIGN.also(
+            "list",
+            "array",
+            "JAX array",
+            "empty array",
+            "True",
+            "-1",
+            "1.5",
+            "2**40",
+            why="any numbers have a sum",
+        )
+    ),
+    "design.rotation_axes": dict(
+        generator=thing(lambda world: np.random.default_rng(0)),
+        joint_axes=array(2, 3, right=np.eye(3)),
+        num_bodies=integer(1, 10**6),
+    ),
+    "evaluation.Evaluation.interval": dict(confidence=CONFIDENCE, seed=SEED),
+    "evaluation.Evaluation.summary": {},
+    "evaluation.EvaluationConfig": dict(
+        episodes=integer(1, 10**6),
+        coefficient=PROBABILITY,
+        task=TASK,
+        num_envs=integer(1, 10**6),
+        recompute_constants=FLAG,
+    ),
+    "evaluation.bootstrap_interval": dict(
+        values=array(3, accepts=("array", "JAX array")),
+        baseline=optional(array(3)),
+        confidence=CONFIDENCE,
+        resamples=integer(1, 10**6),
+        seed=SEED,
+    ),
+    "evaluation.evaluate": dict(
+        agent=AGENT,
+        robot=ROBOT,
+        designs=DESIGN,
+        episodes=optional(integer(1, 10**6)),
+        seed=SEED,
+        engine=ENGINE,
+        config=optional(config("evaluation", "EvaluationConfig")),
+        progress=FLAG,
+    ),
+    "evaluation.paired_gain": dict(
+        after=array(3),
+        before=array(3),
+        confidence=CONFIDENCE,
+        resamples=integer(1, 10**6),
+        seed=SEED,
+    ),
+    "exercises.check_cem_generation": dict(function=ANSWER),
+    "exercises.check_climb": dict(propose=ANSWER, update=ANSWER),
+    "exercises.check_covered": dict(function=ANSWER, trajectory=array(3, 1, 2, accepts=("array",))),
+    "exercises.check_gae": dict(function=ANSWER),
+    "exercises.check_growth": dict(answer=ANSWER),
+    "exercises.check_heavier": dict(f=ANSWER, space=SPACE, kilograms=FINITE),
+    "exercises.check_held_out": dict(
+        answer=ANSWER, gains=array(2, 4, accepts=("JAX array",)), trust_regions=array(2)
+    ),
+    "exercises.check_knee_torque": dict(answer=ANSWER, robot=ROBOT),
+    "exercises.check_largest_step": dict(
+        answer=ANSWER, result=thing(lambda world: world.search_result)
+    ),
+    "exercises.check_pair_distance": dict(function=ANSWER),
+    "exercises.check_penalty_coefficient": dict(function=ANSWER),
+    "exercises.check_per_motor": dict(answer=ANSWER),
+    "exercises.check_radius": dict(function=ANSWER, dim=COUNT),
+    "exercises.check_reward": dict(function=ANSWER),
+    "exercises.check_step": dict(function=ANSWER, max_update=POSITIVE),
+    "exercises.check_successes": dict(answer=ANSWER, levels=COUNT),
+    "exercises.check_surrogate": dict(function=ANSWER, clip_range=PROBABILITY),
+    "exercises.check_total_mass": dict(function=ANSWER, space=SPACE),
+    "exercises.check_trust_regions": dict(results=ANSWER),
+    "exercises.check_twelve_motors": dict(path=ANSWER),
+    "experiments.agent_name": dict(robot=NAME),
+    "experiments.before_after": dict(
+        agent=AGENT,
+        robot=ROBOT,
+        path=OUTPUT,
+        start=integer(0, 2**63, 0),
+        trust_region=TRUST_REGION,
+    ),
+    "experiments.budget": {},
+    "experiments.derived_constants": dict(
+        agent=AGENT,
+        robot=ROBOT,
+        starts=integer(0, 10**5),
+        episodes=integer(2, 10**6),
+        seed=SEED,
+        horizon=integer(1, 10**400),
+    ),
+    "experiments.provenance": dict(agent=optional(AGENT), seconds=SECONDS),
+    "experiments.rank_correlation": dict(
+        x=array(4, right=[1.0, 2.0, 3.0]),
+        y=array(4, right=[1.0, 2.0, 3.0]),
+        resamples=integer(1, 10**6),
+        seed=SEED,
+    ),
+    "experiments.result": dict(name=NAME, compute=FUNCTION, agent=optional(AGENT), recompute=FLAG),
+    "experiments.result_in_parts": dict(
+        name=NAME,
+        parts=thing(lambda world: {"a": len}),
+        agent=optional(AGENT),
+        recompute=FLAG,
+        progress=FLAG,
+        settings=optional(JSON).also("dictionary", "wrong dictionary", why="settings by part"),
+    ),
+    "experiments.result_path": dict(name=NAME),
+    "experiments.scale": {},
+    "experiments.scales_table": {},
+    "experiments.stored_config": dict(name=NAME, agent=optional(AGENT)),
+    "experiments.stored_parts": dict(
+        name=NAME,
+        agent=optional(AGENT),
+        settings=optional(JSON).also("dictionary", "wrong dictionary", why="settings by part"),
+    ),
+    "experiments.stored_result": dict(path=thing(lambda world: world.curve)),
+    "experiments.study_setting": {},
+    "experiments.trained_robots": dict(
+        robots=thing(lambda world: []).also(
+            "list", "list of text", "empty array", "array of text", runs=True, why="robots by name"
+        )
+    ),
+    "experiments.verdict": dict(low=number(right=-1e301), high=number(right=1e301)),
+    "explorer.LiveScene": dict(space=SPACE),
+    "explorer.LiveScene.show": dict(f=optional(DESIGN)),
+    "explorer.Scene": dict(
+        commands=thing(lambda world: []).also("list", "empty array", why="an empty scene"),
+        height=HEIGHT,
+    ),
+    "explorer.Scene.save": dict(path=OUTPUT),
+    "explorer.Scene.static_html": {},
+    "explorer.animate_designs": dict(
+        space=SPACE,
+        trajectory=thing(lambda world: np.zeros((2, world.space.dim))),
+        seconds=number(0.01, 3600),
+        frames=integer(2, 10**4),
+        height=HEIGHT,
+    ),
+    "explorer.show_design": dict(
+        robot_or_space=SPACE,
+        f=optional(DESIGN),
+        qpos=optional(QPOS),
+        spheres=FLAG,
+        height=HEIGHT,
+    ),
+    "files.alone_in": dict(
+        folder=thing(lambda world: world.folder).also("dots", "Path ..", why="a folder")
+    ),
+    "files.atomic_write": dict(
+        path=OUTPUT, data=TEXT.also("long", "long path", "bytes", why="any text or bytes")
+    ),
+    "files.atomic_write_all": dict(
+        files=thing(lambda world: {}).also("dictionary", why="nothing to write")
+    ),
+    "files.load_arrays": dict(
+        path=thing(lambda world: world.curve),
+        like=thing(lambda world: {}).also(*WRONG, why="any structure; the file has to fit it"),
+    ),
+    "files.read_curve": dict(path=thing(lambda world: world.curve)),
+    "files.read_safetensors": dict(
+        path=thing(lambda world: world.curve), fix=TEXT.also(*WRONG, why="words of an error")
+    ),
+    "files.save_arrays": dict(
+        path=OUTPUT,
+        pytree=thing(lambda world: {}).also(
+            *labels(lambda x: isinstance(x, int | float) or np.asarray(x).dtype.kind == "f"),
+            "None",
+            "list",
+            "list of None",
+            "ragged",
+            "dictionary",
+            "JAX array",
+            "NumPy NaN",
+            why="any numbers and arrays",
+        ),
+    ),
+    "imitation.begin_run": dict(
+        config=thing(lambda world: world.train_config),
+        teacher=AGENT,
+        steps=STEPS,
+        folder=optional(FOLDER),
+        engine=ENGINE,
+        progress=FLAG,
+    ),
+    "locomotion.config.TaskConfig": TASK_FIELDS,
+    "locomotion.config.TaskConfig.ancestors": {},
+    "locomotion.config.TaskConfig.evaluation": {},
+    "locomotion.env.Locomotion": dict(
+        robots=ROBOT,
+        num_envs=integer(1, 2**20),
+        engine=ENGINE,
+        config=optional(TASK),
+        sizes=optional(thing(lambda world: world.agent.sizes)),
+        auto_reset=FLAG,
+        threads=integer(0, 4096),
+        physics_options=optional(thing(lambda world: {})).also("dictionary", why="no options"),
+    ),
+    "locomotion.env.Locomotion.descriptions": dict(
+        robot=integer(0, 0, 0), designs=thing(lambda world: world.space.reference[None])
+    ),
+    "locomotion.env.Locomotion.physics_arrays": {},
+    "locomotion.env.Locomotion.reset": dict(
+        key=KEY,
+        designs=optional(DESIGN),
+        coefficient=PROBABILITY,
+        spread=FLAG,
+        keys=optional(thing(lambda world: np.zeros((2, 2), np.uint32))),
+    ),
+    "locomotion.env.Locomotion.restart": dict(
+        state=STATE,
+        rows=array(1, right=[0]).also("list", "empty array", why="no rows"),
+        keys=thing(lambda world: np.zeros((1, 2), np.uint32)),
+        designs=optional(DESIGN),
+        coefficient=PROBABILITY,
+        streak=integer(-(2**31), 2**31 - 1, 0),
+    ),
+    "locomotion.env.Locomotion.restore": dict(state=STATE, arrays=thing(lambda world: [{}])),
+    "locomotion.env.Locomotion.rollout": dict(**CALLED, length=integer(1, 10**6)),
+    "locomotion.env.Locomotion.step": dict(
+        **CALLED, running=optional(thing(lambda world: np.ones(2, bool)))
+    ),
+    "locomotion.env.Locomotion.with_task": dict(config=TASK),
+    "locomotion.rewards.combine": dict(
+        terms=array(23), coefficient=PROBABILITY.also(*WRONG, why=FORMULA)
+    ),
+    "networks.Critic": dict(config=config("networks", "CriticConfig")),
+    "networks.CriticConfig": dict(
+        kind=choice("original"),
+        heads=WIDTH_1,
+        joint_key_widths=WIDTHS,
+        joint_value_latent=WIDTH_1,
+        foot_key_widths=WIDTHS,
+        foot_value_latent=WIDTH_1,
+        head_widths=WIDTHS,
+        **TEMPERATURES,
+    ),
+    "networks.CriticConfig.original": {},
+    "networks.CriticConfig.reduced": {},
+    "networks.CriticConfig.sharp": {},
+    "networks.Policy": dict(config=config("networks", "PolicyConfig")),
+    "networks.PolicyConfig": dict(
+        key_widths=WIDTHS,
+        value_latent=WIDTH_1,
+        core_widths=WIDTHS,
+        initial_std=number(0.5, 1.9, 1.0),
+        log_std_input=choice("tanh"),
+        mean_limit=POSITIVE,
+        std_limits=array(2, right=(0.5, 1.9)),
+        **TEMPERATURES,
+    ),
+    "networks.PolicyConfig.reduced": {},
+    "networks.count_parameters": dict(
+        params=thing(lambda world: world.agent.policy["params"]).also(
+            "NumPy NaN",
+            "array of text",
+            "array of NaN",
+            "empty array",
+            "array",
+            "array of objects",
+            "JAX array",
+            why="any arrays are counted",
+        )
+    ),
+    "networks.initialize": dict(
+        network=thing(lambda world: world.agent.policy_module),
+        key=KEY,
+        constants=optional(thing(lambda world: None)),
+    ),
+    "networks.standardization": dict(descriptions=DESCRIBED, floor=POSITIVE, constant=AT_LEAST_0),
+    "notebooks.execute": dict(path=thing(lambda world: world.notebook), timeout=optional(POSITIVE)),
+    "notebooks.normalise": dict(notebook=thing(lambda world: None)),
+    "notebooks.parser": {},
+    "notebooks.problems": dict(path=thing(lambda world: world.notebook)),
+    "paper.trust_region_gain": dict(robot=TEXT, trust_region=AT_LEAST_0),
+    "paths.data_dir": {},
+    "physics.prepare": dict(
+        robot=ROBOT,
+        solver_iterations=optional(integer(1, 10**4)),
+        line_search=optional(integer(1, 10**4)),
+    ),
+    "physics.mjx.MjxPhysics": dict(
+        robot=ROBOT,
+        num_envs=integer(1, 2**20),
+        impl=choice("jax"),
+        substeps=integer(1, 10**4),
+        solver_iterations=integer(1, 10**4).also("None", why="the model's number"),
+        line_search=integer(1, 10**4).also("None", why="the model's number"),
+    ),
+    "physics.mjx.MjxPhysics.init": dict(
+        embodiments=BODIES, qpos=QPOS, qvel=thing(lambda world: np.zeros(world.robot.model.nv))
+    ),
+    "physics.mjx.MjxPhysics.reset": dict(
+        state=thing(lambda world: world.mjx_state),
+        mask=thing(lambda world: np.ones(2, bool)),
+        embodiments=BODIES,
+        qpos=QPOS,
+        qvel=thing(lambda world: np.zeros(world.robot.model.nv)),
+    ),
+    "physics.mjx.MjxPhysics.step": dict(
+        state=thing(lambda world: world.mjx_state), ctrl=thing(lambda world: np.zeros((2, 2)))
+    ),
+    "physics.mjx.MjxPhysics.velocity": dict(state=thing(lambda world: world.mjx_state)),
+    "physics.mjx.MjxPhysics.with_velocity": dict(
+        state=thing(lambda world: world.mjx_state),
+        qvel=thing(lambda world: np.zeros(world.robot.model.nv)),
+    ),
+    "physics.native.NativePhysics": dict(
+        robot=ROBOT,
+        num_envs=integer(1, 2**20),
+        threads=integer(0, 4096),
+        substeps=integer(1, 10**4),
+        solver_iterations=optional(integer(1, 10**4)),
+        line_search=optional(integer(1, 10**4)),
+        recompute_constants=FLAG,
+    ),
+    "physics.native.NativePhysics.get_model": dict(env=integer(0, 1, 0)),
+    "physics.native.NativePhysics.restore": dict(state=thing(lambda world: world.physics.state())),
+    "physics.native.NativePhysics.set_designs": dict(ids=array(right=[0, 1]), embodiments=BODIES),
+    "physics.native.NativePhysics.set_state": dict(
+        ids=array(right=[0, 1]).also("list", "empty array", why="no simulations"),
+        qpos=QPOS,
+        qvel=thing(lambda world: np.zeros(world.robot.model.nv)),
+    ),
+    "physics.native.NativePhysics.state": {},
+    "physics.native.NativePhysics.step": dict(
+        ctrl=thing(lambda world: np.zeros((2, 2))),
+        qpos=optional(thing(lambda world: np.stack([world.robot.home] * 2))),
+        qvel=optional(thing(lambda world: np.zeros((2, world.robot.model.nv)))),
+        running=optional(thing(lambda world: np.zeros(2, bool))),
+    ),
+    "plots.Table": dict(
+        header=thing(lambda world: ("a",)),
+        rows=thing(lambda world: ()).also("list", "empty array", why="no rows"),
+        caption=TEXT.also("long", "long path", why="a caption may be long"),
+    ),
+    "plots.Table.markdown": {},
+    "plots.agents_table": dict(
+        agents=thing(lambda world: []).also("list", "empty array", why="an empty table")
+    ),
+    "plots.intervals": dict(
+        labels=thing(lambda world: ["a"]).also("list of text", "array of text", why="labels"),
+        values=thing(lambda world: [(0.0, -1.0, 1.0)]).also("list of None", why="an empty row"),
+        colours=thing(lambda world: []).also("list", "empty array", why="the default colours"),
+        ax=optional(AXES),
+    ),
+    "plots.learning_curve": dict(
+        path=thing(lambda world: world.curve),
+        y=choice("coefficient"),
+        x=choice("steps"),
+        ax=optional(AXES).given(lambda world: world.axes),
+        smooth=integer(1, 10**6),
+    ),
+    "plots.paper_table": dict(
+        rows=thing(lambda world: [("a", 1, 2)]).also("list", "empty array", why="an empty table"),
+        digits=integer(0, 17),
+        caption=TEXT.also("long", "long path", why="a caption may be long"),
+        note=TEXT,
+    ),
+    "plots.table": dict(
+        rows=thing(lambda world: [("a",)]).also("list", "empty array", why="an empty table"),
+        header=thing(lambda world: ["a"]).also(
+            "list of None",
+            "list of text",
+            "ragged",
+            "array of text",
+            "array of NaN",
+            "array",
+            "array of objects",
+            "JAX array",
+            why="titles are made texts",
+        ),
+        digits=integer(0, 17),
+        caption=TEXT.also("long", "long path", why="a caption may be long"),
+    ),
+    "plots.use_style": {},
+    "ppo.TrainConfig": dict(
+        name=NAME,
+        robots=thing(lambda world: "robot").also(
+            "a/b", "list of text", "array of text", why="names or paths, read later"
+        ),
+        scale=choice("smoke"),
+        seed=SEED,
+        policy=config("networks", "PolicyConfig"),
+        critic=config("networks", "CriticConfig"),
+        standardize=FLAG,
+        num_envs=integer(1, 2**24, 4096),
+        rollout_length=integer(2**14, 2**24, 64),
+        total_steps=STEPS,
+        minibatch_size=integer(64, 2**18, 64),
+        epochs=integer(1, 2**24),
+        learning_rate=array(2, right=(1e-3, 1e-4)),
+        discount=PROBABILITY,
+        gae_lambda=PROBABILITY,
+        value_lambda=optional(PROBABILITY),
+        cut_at_commands=FLAG,
+        clip_range=POSITIVE,
+        entropy_coefficient=AT_LEAST_0,
+        max_gradient_norm=POSITIVE,
+        kl_threshold=POSITIVE.also("inf", why="no threshold"),
+        task=TASK,
+        learn_policy=FLAG,
+        mean_actions=FLAG,
+        state_bank=integer(1, 2**24),
+    ),
+    "ppo.TrainConfig.at_scale": dict(scale=choice("smoke"), robot=ROBOT_NAME),
+    "ppo.TrainConfig.full": dict(robot=ROBOT_NAME),
+    "ppo.TrainConfig.reduced": dict(robot=ROBOT_NAME),
+    "ppo.TrainConfig.smoke": dict(robot=ROBOT_NAME),
+    "ppo.Trainer": dict(
+        config=thing(lambda world: world.train_config),
+        folder=optional(FOLDER),
+        engine=ENGINE,
+        policy=optional(AGENT),
+    ),
+    "ppo.Trainer.last_iteration": dict(
+        max_steps=optional(integer(0, 10**15)).also("2**40", why="more than all steps", runs=True)
+    ),
+    "ppo.Trainer.run": dict(
+        max_steps=optional(integer(0, 10**15)),
+        max_seconds=SECONDS,
+        progress=FLAG,
+        curve_interval=optional(COUNT),
+    ),
+    "ppo.Trainer.save": {},
+    "ppo.Trainer.save_agent": dict(folder=optional(FOLDER)),
+    "ppo.Trainer.start": {},
+    "ppo.Trainer.state_bank": dict(rollouts=integer(1, 10**5)),
+    "ppo.advantages": dict(
+        reward=array(2, 3),
+        value=array(2, 3),
+        last_value=array(2),
+        terminated=array(2, 3, dtype=bool),
+        truncated=array(2, 3, dtype=bool),
+        discount=PROBABILITY.also(*WRONG, why=FORMULA),
+        gae_lambda=PROBABILITY.also(*WRONG, why=FORMULA),
+    ),
+    "ppo.anneal": dict(name=NAME, steps=STEPS, last_rate=AT_LEAST_0, replace=FLAG, **RESUMED),
+    "ppo.as_continued": dict(
+        config=thing(lambda world: world.train_config), folder=optional(FOLDER)
+    ),
+    "ppo.make_policy_function": dict(
+        policy=thing(lambda world: world.agent.policy_module), mean_actions=FLAG
+    ),
+    "ppo.make_update": dict(
+        config=thing(lambda world: world.train_config),
+        policy=thing(lambda world: world.agent.policy_module),
+        critic=thing(lambda world: world.agent.critic_module),
+    ),
+    "ppo.train": dict(
+        config=thing(lambda world: world.train_config),
+        max_steps=optional(STEPS),
+        state_only=FLAG,
+        replace=FLAG,
+        **RESUMED,
+    ),
+    "ppo.train_critic": dict(
+        agent=AGENT, critic=config("networks", "CriticConfig"), steps=optional(STEPS), **RESUMED
+    ),
+    "published.load_published_policy": dict(
+        folder=thing(lambda world: world.folder), name=optional(NAME)
+    ),
+    "recording.record_episode": dict(
+        agent=AGENT,
+        robot=ROBOT,
+        design=optional(DESIGN),
+        seconds=number(0.02),
+        command=optional(array(3)),
+        seed=SEED,
+        coefficient=PROBABILITY,
+        task=optional(TASK),
+    ),
+    "robots.find": dict(name_or_path=ROBOT_FILE),
+    "robots.load_robot": dict(name_or_path=ROBOT_FILE),
+    "robots.require_robot": dict(robot=ROBOT),
+    "robots.robots": {},
+    "runtime.cache_folder": {},
+    "runtime.enable_compilation_cache": {},
+    "runtime.keep_memory": {},
+    "runtime.start_notebook": {},
+    "search.bayesian.BOConfig": dict(
+        initial_points=integer(2, 10**6, 2),
+        restarts=CONFIG_COUNT,
+        raw_samples=CONFIG_COUNT,
+        steps=CONFIG_COUNT,
+        **ITERATIONS,
+    ),
+    "search.directions.ARSConfig": dict(
+        directions=CONFIG_COUNT,
+        perturbation_std=POSITIVE,
+        learning_rate=POSITIVE,
+        top_fraction=number(1e-300, 1, 0.5),
+        **ITERATIONS,
+    ),
+    "search.evolution.CMAESConfig": dict(
+        particles=optional(integer(2, 10**6, 4)), **ITERATIONS, **STD
+    ),
+    "search.evolution.CMAESConfig.population": dict(dim=COUNT),
+    "search.loop.cores": {},
+    "search.loop.iterate": dict(
+        objective=thing(lambda world: world.objective).also(*WRONG, why="the caller's own"),
+        starts=array(1, 3, accepts=("JAX array",)),
+        key=KEY,
+        config=choice(None).also(*WRONG, why="the caller's own"),
+        steps=thing(lambda world: world.steps),
+        evaluations=integer(0, right=0),
+    ),
+    "search.methods.search": dict(
+        method=choice("vgds"),
+        agent=AGENT,
+        robot=ROBOT,
+        f=DESIGN,
+        trust_region=TRUST_REGION,
+        reference=optional(DESIGN),
+        seed=SEED,
+        batch_size=COUNT,
+        states=STATES,
+        frozen=FROZEN,
+    ),
+    "search.objective.DesignCritic.descriptions": dict(designs=DESIGN),
+    "search.objective.Objective.__call__": dict(designs=DESIGN, states=STATES),
+    "search.objective.Objective.batch": dict(key=KEY),
+    "search.objective.Objective.hold": dict(designs=DESIGN),
+    "search.objective.Objective.of": dict(
+        agent=AGENT,
+        robot=ROBOT,
+        trust_region=TRUST_REGION,
+        reference=optional(DESIGN),
+        states=STATES,
+        batch_size=COUNT,
+        frozen=FROZEN,
+    ),
+    "search.objective.Objective.penalty": dict(designs=DESIGN),
+    "search.objective.Objective.value": dict(designs=DESIGN, states=STATES),
+    "search.objective.bank": dict(agent=AGENT, robot=ROBOT),
+    "search.objective.design_critic": dict(robot=ROBOT, config=config("networks", "CriticConfig")),
+    "search.objective.trim": dict(states=thing(lambda world: world.agent.states), robot=ROBOT),
+    "search.particles.GCPFOConfig": dict(
+        regions=CONFIG_COUNT,
+        particles=integer(2, 10**6, 2),
+        step_size=POSITIVE,
+        temperature=POSITIVE,
+        epsilon=POSITIVE,
+        **ITERATIONS,
+    ),
+    "search.populations.CEMConfig": dict(
+        particles=CONFIG_COUNT,
+        elite_fraction=number(1e-300, 1, 0.5),
+        minimum_std=POSITIVE,
+        **ITERATIONS,
+        **STD,
+    ),
+    "search.populations.DEConfig": dict(
+        particles=integer(4, 10**6, 4),
+        weight=number(0, 2),
+        crossover=PROBABILITY,
+        initial_std=optional(POSITIVE),
+        **ITERATIONS,
+    ),
+    "search.populations.PSOConfig": dict(
+        particles=CONFIG_COUNT,
+        inertia=AT_LEAST_0,
+        cognitive=AT_LEAST_0,
+        social=AT_LEAST_0,
+        initial_std=optional(POSITIVE),
+        **ITERATIONS,
+    ),
+    "search.sampling.RandomConfig": dict(candidates=CONFIG_COUNT, **ITERATIONS),
+    "search.sampling.TuRBOConfig": dict(
+        candidates=CONFIG_COUNT,
+        # Between the smallest and the largest one.
+        radius=number(0.005, 0.5, 0.1),
+        minimum_radius=number(1e-300, 0.1, 0.005),
+        maximum_radius=number(0.1, right=0.5),
+        shrink=number(1e-300, 1, 0.7),
+        expand=number(1, right=1.3),
+        **ITERATIONS,
+    ),
+    "search.vgds.VGDSConfig": dict(learning_rate=POSITIVE, max_update=POSITIVE, **ITERATIONS),
+    "studies.Run": dict(
+        method=choice("vgds").also(*WRONG, why="looked at by the studies"),
+        trust_region=choice(1.0).also(*WRONG, why="looked at by the studies"),
+        origin=choice("start").also(*WRONG, why="looked at by the studies"),
+    ),
+    "studies.available": STUDY,
+    "studies.design_study": STUDY | dict(progress=FLAG),
+    "studies.gain": dict(
+        rows=RECORDS,
+        method=choice("none"),
+        over=choice("start"),
+        trust_region=optional(choice(1.0)),
+    ),
+    "studies.gains": dict(records=RECORDS, quantity=choice("return")),
+    "studies.installed": dict(runs=RUNS.also("empty array", why="no runs")),
+    "studies.published_policy": dict(
+        robot=ROBOT,
+        agent=AGENT,
+        folder=optional(thing(lambda world: world.folder)),
+        starts=integer(1, 10**6),
+        episodes=integer(1, 10**6),
+    ),
+    "studies.size_share": dict(
+        agent=AGENT,
+        robot=ROBOT,
+        starts=integer(1, 10**6),
+        iterations=optional(integer(1, 10**6)),
+        **EVALUATED,
+    ),
+    "studies.value_against_return": dict(
+        agent=AGENT, robot=ROBOT, designs=integer(1, 10**6), progress=FLAG, **EVALUATED
+    ),
+    "validation.Report.write": dict(path=OUTPUT),
+    "validation.hold": dict(robot=ROBOT, seconds=number(0, 10**6)),
+    "validation.validate_robot": dict(
+        name_or_path=ROBOT_FILE.also(
+            "dots", "a/b", "Path ..", why="the report says that there is no file", runs=True
+        )
+    ),
+    "video.Renderer": dict(model=MODEL, spheres=FLAG, smooth=FLAG, opengl=FLAG, **SIZE),
+    "video.Renderer.centre": {},
+    "video.Renderer.close": {},
+    "video.Renderer.distance": dict(lookat=array(3), **CAMERA),
+    "video.Renderer.picture": dict(
+        qpos=QPOS, lookat=optional(array(3)), distance=DISTANCE, **CAMERA
+    ),
+    "video.Renderer.place": dict(qpos=QPOS),
+    "video.body_grid": dict(
+        bodies=thing(lambda world: [world.robot]),
+        qpos=optional(thing(lambda world: [world.robot.home])),
+        labels=optional(thing(lambda world: ["a"])).also(
+            "list of text", "array of text", why="one label"
+        ),
+        columns=optional(COUNT),
+        **SIZE,
+        **CAMERA,
+    ),
+    "video.encode_video": PLAYED,
+    "video.ffmpeg": {},
+    "video.film_strip": dict(frames=FRAMES, count=integer(1, 1000)),
+    "video.find_opengl": {},
+    "video.render_frame": dict(body=ROBOT, qpos=optional(QPOS), spheres=FLAG, **SIZE),
+    "video.render_rollout": dict(
+        body=ROBOT,
+        qpos=thing(lambda world: world.robot.home[None]),
+        fps=FPS,
+        step_seconds=number(1e-6, 1000, 0.02),
+        distance=DISTANCE,
+        spheres=FLAG,
+        **SIZE,
+        **CAMERA,
+    ),
+    "video.require_size": SIZE,
+    "video.save_video": dict(path=OUTPUT, **PLAYED),
+    "video.show_image": dict(
+        picture=thing(lambda world: np.zeros((32, 32, 3), np.uint8)),
+        width=WIDTH,
+        colours=optional(integer(2, 256, 8)),
+    ),
+    "video.show_video": PLAYED | dict(width=WIDTH),
+    "video.side_by_side": dict(
+        clips=FRAMES, labels=optional(thing(lambda world: ["a"])).also("list of text", why="one")
+    ),
+    "video.standing_pose": dict(model=MODEL),
+    "video.video_html": PLAYED | dict(width=WIDTH),
+    "video.with_label": dict(frames=FRAMES, text=TEXT),
+}
