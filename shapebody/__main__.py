@@ -42,6 +42,14 @@ def parser() -> argparse.ArgumentParser:
     sharpen.add_argument("--steps", type=int, help="12 %% of those of training if not given")
     sharpen.add_argument("--hours", type=float, help="stop after this time; run again to continue")
 
+    sharpen.add_argument(
+        "--task-of",
+        choices=("evaluation", "training"),
+        default="evaluation",
+        help="which task the critic learns: that of the evaluation of designs (default), or that "
+        "of the policy's training",
+    )
+
     design = commands.add_parser("design", help="search for a better body")
     design.add_argument("robot", help="name in data/robots, or an MJCF file")
     design.add_argument("--agent", help="default: the agent named as the robot")
@@ -161,6 +169,7 @@ def _sharpen(options):
         folder=agent_folder(options.agent),
         max_seconds=seconds,
         engine=options.engine,
+        task_of=options.task_of,
     )
     if sharper is agent:
         print("not finished: the agent is as it was, the same command continues")

@@ -156,9 +156,8 @@ def critic_tasks(old, new, robot, **changes) -> dict:
 
     data/results/critic_tasks_<robot>.json is this with `new`, the shipped agent, and `old`, the one
     shipped before it (in the history of this repository, commit 1568810), whose critic was trained
-    as long on the task of the policy's training. It is `train_critic(new, CriticConfig.sharp(),
-    6_000_000, task=replace(task, horizon=200, design_radius=(0.0, 1.0)))` with the `task` of
-    `new.metadata["config"]`.
+    as long on the task of the policy's training: `train_critic(new, CriticConfig.sharp(),
+    6_000_000, task_of="training")`.
 
     Args:
         changes: settings of `compare_critics`.

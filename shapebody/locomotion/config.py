@@ -9,6 +9,8 @@ from dataclasses import dataclass
 from math import inf, nan, pi
 from numbers import Integral, Real
 
+from shapebody.checks import require_choice, shown
+
 CONTROL_STEP = 0.02
 """Seconds per control step (50 Hz); physics runs four substeps of 5 ms inside it."""
 
@@ -126,9 +128,10 @@ class TaskConfig:
     ancestors for episodes of 1000 control steps)."""
 
     def __post_init__(self):
-        if self.action_delay not in (None, 0, 1) or isinstance(self.action_delay, bool):
+        delay = self.action_delay
+        if delay is not None and not _is_number(delay, Integral, 0, 1):
             raise ValueError(
-                f"action_delay is {self.action_delay!r}; expected 0, 1 or None (random per episode)"
+                f"action_delay is {shown(delay)}; expected 0, 1 or None (random per episode)"
             )
         try:
             low, high = (float(r) for r in self.design_radius)
@@ -136,32 +139,28 @@ class TaskConfig:
             low, high = nan, nan
         if not 0 <= low <= high <= 1:
             raise ValueError(
-                f"design_radius is {self.design_radius!r}; expected two numbers (low, high) with "
-                "0 <= low <= high <= 1"
+                f"design_radius is {shown(self.design_radius)}; expected two numbers (low, high) "
+                "with 0 <= low <= high <= 1"
             )
         object.__setattr__(self, "design_radius", (low, high))
         limit = self.command_limit
         if limit is not None and not (_is_number(limit, Real, 0, inf) and limit > 0):
             raise ValueError(
-                f"command_limit is {limit!r}; expected a positive number, in m/s, or None (it "
+                f"command_limit is {shown(limit)}; expected a positive number, in m/s, or None (it "
                 "follows from the robot's dimensions)"
             )
         bound = self.velocity_bound
         if bound is not None and not (_is_number(bound, Real, 0, inf) and bound > 0):
             raise ValueError(
-                f"velocity_bound is {bound!r}; expected a positive number, in m/s and rad/s, or "
-                "None (no bound)"
+                f"velocity_bound is {shown(bound)}; expected a positive number, in m/s and rad/s, "
+                "or None (no bound)"
             )
-        if self.curriculum_success not in ("tracking", "return"):
-            raise ValueError(
-                f"curriculum_success is {self.curriculum_success!r}; expected 'tracking' or "
-                "'return'"
-            )
+        require_choice("curriculum_success", self.curriculum_success, ("tracking", "return"))
         for expected, (kind, low, high, names) in _RANGES.items():
             for name in names.split():
                 value = getattr(self, name)
                 if not _is_number(value, kind, low, high):
-                    raise ValueError(f"{name} is {value!r}; expected {expected}")
+                    raise ValueError(f"{name} is {shown(value)}; expected {expected}")
 
     @classmethod
     def ancestors(cls, **changes) -> "TaskConfig":
