@@ -6,8 +6,6 @@ it: TypeError for an object of another class (`require_kind`), ValueError otherw
 where a value enters the package, before anything expensive, and never inside compiled code.
 """
 
-import errno
-import functools
 import math
 import numbers
 import os
@@ -26,7 +24,6 @@ LONGEST_PART = 255
 """Bytes of a file's or folder's name, on all usual file systems."""
 LONGEST_PATH = 4095
 """Bytes of a path, on Linux."""
-_FULL = (errno.ENOSPC, errno.EDQUOT)
 
 
 def shown(value) -> str:
@@ -175,7 +172,8 @@ def require_array(name: str, value, shape=None, *, kinds: str = "fiub", finite: 
 
 def require_shape(name: str, array, shape):
     """The array; ValueError if its shape is another, see `require_array`. For traced ones, too."""
-    if not _is_array(array):
+    letters = _is_array(array) and getattr(array.dtype, "kind", "f") in "OSUMm"
+    if not _is_array(array) or letters:
         raise refuse(name, array, f"an array {'' if shape is None else shape_text(shape)}".strip())
     if shape is None:
         return array
@@ -330,28 +328,3 @@ def require_records(name: str, value, columns: Iterable[str]) -> list[dict]:
         if missing:
             raise refuse(f"an entry of {name}", record, f"one with {', '.join(missing)}")
     return records
-
-
-# ------------------------------------------------------------------ writing
-
-
-def names_the_file(function: Callable) -> Callable:
-    """A function whose first argument is a path, or a dictionary by path: if it cannot write, the
-    error says where, and of a full disk that it is full."""
-
-    @functools.wraps(function)
-    def named(*arguments, **options):
-        try:
-            return function(*arguments, **options)
-        except OSError as error:
-            target = (*arguments, *options.values())[0]
-            paths = list(target) if isinstance(target, Mapping) else [target]
-            if getattr(error, "told", False) or not paths:
-                raise
-            reason = error.strerror or str(error)
-            fix = "make room on that disk" if error.errno in _FULL else "give another path"
-            told = type(error)(f"{paths[0]} cannot be written: {reason}; {fix}")
-            told.errno, told.told = error.errno, True
-            raise told from error
-
-    return named

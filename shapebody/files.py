@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import csv
+import errno
 import fcntl
 import io
 import os
@@ -23,7 +24,6 @@ import numpy as np
 import safetensors.numpy
 
 from shapebody.checks import (
-    names_the_file,
     require_folder,
     require_kind,
     require_output,
@@ -32,7 +32,6 @@ from shapebody.checks import (
 from shapebody.stored import read_metadata, read_safetensors, read_text
 
 
-@names_the_file
 def atomic_write(path: str | Path, data: bytes | str) -> Path:
     """Write a file so that it is never seen half-written; its folder is created if needed.
 
@@ -57,13 +56,16 @@ def atomic_write(path: str | Path, data: bytes | str) -> Path:
 
 @contextlib.contextmanager
 def names_path(path: Path):
-    """Errors of the operating system in the block, such as a full disk, name this path."""
+    """Errors of the operating system in the block say what cannot be written, and of a full disk
+    that it is full."""
     try:
         yield
     except OSError as error:
-        if error.errno is None or error.filename == str(path):
+        if error.errno is None:  # an error of ours
             raise
-        raise OSError(error.errno, error.strerror, str(path)) from error
+        full = error.errno in (errno.ENOSPC, errno.EDQUOT)
+        fix = "make room on that disk" if full else "give another path"
+        raise type(error)(f"{path} cannot be written: {error.strerror}; {fix}") from error
 
 
 def _write(file, data: bytes | str) -> None:

@@ -131,9 +131,10 @@ def design_study(
 
 def _settings(runs, starts, episodes, horizon, seed, first_start, iterations, recompute):
     """(runs, setting, settings of every search) of a study; ValueError for what cannot be."""
+    _require_counts(starts=starts, episodes=episodes, horizon=horizon)
+    for name, value in (("seed", seed), ("first_start", first_start)):
+        require_integer(name, value, 0, 1_000_000)
     setting = _setting(starts, episodes, horizon, seed, first_start)
-    for name, value in setting.items():
-        require_integer(name, value, 0 if name in ("seed", "first_start") else 1, 1_000_000)
     short = {} if iterations is None else {"iterations": iterations}
     runs = require_list("runs", runs)
     for run in runs:

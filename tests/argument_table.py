@@ -725,7 +725,7 @@ FUNCTIONS = {
         config=thing(lambda world: world.train_config),
         folder=optional(FOLDER),
         engine=ENGINE,
-        policy=optional(AGENT),
+        policy=optional(thing(lambda world: world.agent.policy)),
     ),
     "ppo.Trainer.last_iteration": dict(
         max_steps=optional(integer(0, 10**15)).also("2**40", why="more than all steps", runs=True)
@@ -749,7 +749,14 @@ FUNCTIONS = {
         discount=PROBABILITY.also(*WRONG, why=FORMULA),
         gae_lambda=PROBABILITY.also(*WRONG, why=FORMULA),
     ),
-    "ppo.anneal": dict(name=NAME, steps=STEPS, last_rate=AT_LEAST_0, replace=FLAG, **RESUMED),
+    "ppo.anneal": RESUMED
+    | dict(
+        name=NAME,
+        steps=STEPS,
+        last_rate=AT_LEAST_0,
+        replace=FLAG,
+        folder=optional(FOLDER).given(None),
+    ),
     "ppo.as_continued": dict(
         config=thing(lambda world: world.train_config), folder=optional(FOLDER)
     ),
@@ -905,7 +912,7 @@ FUNCTIONS = {
         trust_region=optional(choice(1.0)),
     ),
     "studies.gains": dict(records=RECORDS, quantity=choice("return")),
-    "studies.installed": dict(runs=RUNS.also("empty array", why="no runs")),
+    "studies.installed": dict(runs=RUNS),
     "studies.published_policy": dict(
         robot=ROBOT,
         agent=AGENT,

@@ -166,7 +166,7 @@ AGENT_FOLDER = thing(lambda world: world.agent_folder)
 TASK = thing(lambda world: world.task)
 KEY = thing(lambda world: jax.random.PRNGKey(0))
 AXES = thing(lambda world: world.axes)
-RUNS = thing(lambda world: world.runs).also("list", why="no runs: only the starts")
+RUNS = thing(lambda world: world.runs).also("list", "empty array", why="no runs: only the starts")
 RECORDS = thing(lambda world: world.records)
 FRAMES = thing(lambda world: np.zeros((2, 32, 32, 3), np.uint8))
 HEIGHT = integer(16, 8192, 64)
@@ -417,6 +417,13 @@ def _(world):
     path = world.folder / "a.ipynb"
     nbformat.write(nbformat.v4.new_notebook(), path)
     return path
+
+
+@makes("cma_es", "search.evolution.CMAESConfig")
+def _(world):
+    from shapebody.search.evolution import CMAESConfig
+
+    return CMAESConfig()
 
 
 @makes("steps")

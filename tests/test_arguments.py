@@ -143,7 +143,7 @@ def complaint(error, name, value) -> str:
     if not Path(file).is_relative_to(PACKAGE) or not line.startswith("raise"):
         return f"raised elsewhere: {where}"
     text = str(error)
-    short = " ".join(repr(value).split())[1:40]
+    short = str(value)[:40] if isinstance(value, str | Path) else repr(value)[:40]
     words = (name, name.removesuffix("s"), short, checks.shown(value), *WORDS.get(name, ()))
     if not any(word and word in text for word in words):
         return f"names neither argument nor value: {where}"
@@ -166,10 +166,11 @@ WORDS = {
     "reference": ("design",),
     "trajectory": ("design",),
     "descriptions": ("static",),
-    "rows": ("row", "cell"),
+    "rows": ("row", "cell", "gain of"),
     "ids": ("designs of",),
-    "path": ("does not exist",),
+    "reward": ("value",),
     "method": ("gain of",),
+    "records": ("reference",),
     "over": ("gain of",),
     "y": ("column",),
     "x": ("column", "paired", "two lists"),

@@ -1,12 +1,23 @@
 import json
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from shapebody import experiments, studies
+from shapebody.checkpoints import Agent
 
-AGENT = SimpleNamespace(name="a", hash="1234", states_hash="56", metadata={"steps": 7})
+
+class Known(Agent):
+    """An agent of which nothing is there but what tells it from others."""
+
+    hash, states_hash = None, "56"
+
+    def __init__(self, hash):
+        for name, value in {"name": "a", "metadata": {"steps": 7}, "hash": hash}.items():
+            object.__setattr__(self, name, value)
+
+
+AGENT = Known("1234")
 
 
 @pytest.fixture
@@ -34,7 +45,7 @@ def test_scale_is_read_from_the_environment(monkeypatch):
     monkeypatch.setenv("SHAPEBODY_SCALE", "smoke")
     assert experiments.budget().starts == experiments.BUDGETS["smoke"].starts
     monkeypatch.setenv("SHAPEBODY_SCALE", "huge")
-    with pytest.raises(ValueError, match="huge.*smoke, reduced, full"):
+    with pytest.raises(ValueError, match="huge.*'smoke', 'reduced', 'full'"):
         experiments.scale()
 
 
@@ -62,7 +73,7 @@ def test_result_of_another_agent_or_setting_is_computed_anew(results):
     compute = Computation()
     experiments.result("x", compute, AGENT, starts=2)
     experiments.result("x", compute, AGENT, starts=3)
-    other = SimpleNamespace(name="a", hash="5678", states_hash="56", metadata={})
+    other = Known("5678")
     stored = experiments.result("x", compute, other, starts=3)
     assert compute.calls == 3
     assert stored["provenance"]["agent"]["hash"] == "5678"
@@ -197,7 +208,7 @@ def test_gains_of_incomplete_records():
         studies.gains(synthetic(penalty=(6.0, 7.5)))
     with pytest.raises(ValueError, match="0 evaluations of the reference"):
         studies.gains(synthetic()[:9])
-    with pytest.raises(ValueError, match="no gain of vgds over start at 5"):
+    with pytest.raises(ValueError, match="no gain of 'vgds' over 'start' at 5"):
         studies.gain(studies.gains(synthetic()), "vgds", "start", 5.0)
 
 

@@ -50,7 +50,9 @@ def test_options_of_training(files, monkeypatch):
     assert calls[0] == given | dict(max_steps=9, state_only=False)
     assert calls[1] == given
     assert calls[2] == dict(max_seconds=None, engine="auto", replace=False)
-    assert calls[3] == dict(max_seconds=7200, engine="mjx", folder=Path(agent))
+    assert calls[3] == dict(
+        max_seconds=7200, engine="mjx", folder=Path(agent), task_of="evaluation"
+    )
 
 
 def test_design_looks_at_its_output_before_it_searches(files, monkeypatch, tmp_path, capsys):

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 import jax
 import numpy as np
 
+from shapebody.checks import require_integer
 from shapebody.search.loop import (
     Search,
     last_finite,
@@ -38,6 +39,7 @@ class CMAESConfig:
 
     def population(self, dim: int) -> int:
         """Population size for designs of length `dim`, 21 for the Go2's 358."""
+        require_integer("dim", dim, 1)
         return int(self.particles or 4 + math.floor(3 * math.log(dim)))
 
 

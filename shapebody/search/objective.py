@@ -162,9 +162,9 @@ class Objective:
 
     def batch(self, key) -> Observation:
         """A minibatch of states, drawn without replacement; the whole bank if it is smaller."""
+        require_key("key", key)
         if self.num_states <= self.batch_size:
             return self.states
-        require_key("key", key)
         chosen = jax.random.choice(key, self.num_states, (self.batch_size,), replace=False)
         return jax.tree.map(lambda x: x[chosen], self.states)
 
