@@ -270,11 +270,11 @@ class Renderer:
         return fine[:, 0, :, 0].copy() if self._detail == 1 else fine.mean((1, 3)).astype(np.uint8)
 
 
-def _model_of(body) -> mujoco.MjModel:
+def _model_of(body, name: str = "body") -> mujoco.MjModel:
     model = getattr(body, "model", body)
     if not isinstance(model, mujoco.MjModel):
         expected = "a mujoco.MjModel or a Robot; for a design, space.to_model(f)"
-        raise refuse("body", body, expected, kind=TypeError)
+        raise refuse(name, body, expected, kind=TypeError)
     return model
 
 
@@ -489,7 +489,8 @@ def body_grid(
 
     qpos: one [nq] per body, the standing poses if None.
     """
-    models = [_model_of(body) for body in require_list("bodies", bodies, 10_000)]
+    bodies = require_list("bodies", bodies, 10_000)
+    models = [_model_of(body, "an entry of bodies") for body in bodies]
     if not models:
         raise ValueError("bodies is empty; expected at least one body")
     if labels is not None:

@@ -776,7 +776,11 @@ FUNCTIONS = {
         **RESUMED,
     ),
     "ppo.train_critic": dict(
-        agent=AGENT, critic=config("networks", "CriticConfig"), steps=optional(STEPS), **RESUMED
+        agent=AGENT,
+        critic=config("networks", "CriticConfig"),
+        steps=optional(STEPS),
+        task_of=choice("training"),
+        **RESUMED,
     ),
     "published.load_published_policy": dict(
         folder=thing(lambda world: world.folder), name=optional(NAME)
@@ -978,7 +982,10 @@ FUNCTIONS = {
     ),
     "video.show_video": PLAYED | dict(width=WIDTH),
     "video.side_by_side": dict(
-        clips=FRAMES, labels=optional(thing(lambda world: ["a"])).also("list of text", why="one")
+        clips=FRAMES,
+        labels=optional(thing(lambda world: ["a"])).also(
+            "list of text", "array of text", why="one label"
+        ),
     ),
     "video.standing_pose": dict(model=MODEL),
     "video.video_html": PLAYED | dict(width=WIDTH),

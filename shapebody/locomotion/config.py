@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from math import inf, nan, pi
 from numbers import Integral, Real
 
-from shapebody.checks import require_choice, shown
+from shapebody.checks import require_choice, require_flag, shown
 
 CONTROL_STEP = 0.02
 """Seconds per control step (50 Hz); physics runs four substeps of 5 ms inside it."""
@@ -155,6 +155,7 @@ class TaskConfig:
                 f"velocity_bound is {shown(bound)}; expected a positive number, in m/s and rad/s, "
                 "or None (no bound)"
             )
+        require_flag("fixed_coefficient", self.fixed_coefficient)
         require_choice("curriculum_success", self.curriculum_success, ("tracking", "return"))
         for expected, (kind, low, high, names) in _RANGES.items():
             for name in names.split():
