@@ -10,7 +10,7 @@ from PIL import Image
 from test_networks import published_layers, write_published
 from tiny import quick_compilation, tiny_agent, tiny_robot
 
-from shapebody import experiments, paper, studies
+from shapebody import critics, experiments, paper, studies
 from shapebody.checkpoints import load_agent
 from shapebody.design import DesignSpace
 from shapebody.evaluation import EvaluationConfig, evaluate, paired_gain
@@ -286,14 +286,78 @@ def test_readme_states_the_stored_results():
     """The tables of agents, row by row, from data/results, and the sentences that go with them."""
     readme = (Path(__file__).parents[1] / "README.md").read_text()
     text = " ".join(readme.split())
-    episodes = {}
-    for name in experiments.trained_robots(paper.ROBOTS):
-        first, second, episodes[name], *_ = readme_rows(name)
+    added, parts, names = {}, {}, experiments.trained_robots(paper.ROBOTS)
+    for name in names:
+        first, second, episodes, added[name], parts[name] = readme_rows(name)
         for row in (first, second):
             assert row in readme, f"README.md should have: {row}"
-    for name, (study, others, apart) in episodes.items():
-        assert study == apart and others == 50
-        assert f"{study} for the {load_robot(name).display_name}" in text
+        assert episodes[0] == episodes[2] and episodes[1] == 50
+        assert f"{episodes[0]} for the {load_robot(name).display_name}" in text
+
+    go2, golem = (added[name] for name in ("unitree_go2", "golem"))
+    assert "The Go2s that are found track better and last longer" in text
+    assert go2["tracking_error"]["high"] < 0 < go2["length"]["low"]
+    assert "most of their gain over the reference is the size of the body" in text
+    assert parts["unitree_go2"]["size only"].low > parts["unitree_go2"]["all but size"].high
+    assert "The Golems track no better and last no longer" in text
+    assert golem["tracking_error"]["high"] > -0.001 and golem["length"]["high"] < 1
+    assert "their size alone gains nothing" in text
+    alone = parts["golem"]["size only"]
+    assert alone.low < 0 < alone.high
+
+    assert "at λ = 0, VGDS makes the MIT Humanoid and the Golem worse than the penalty" in text
+    for name in ("mit_humanoid", "golem"):
+        path = data_dir() / "results" / f"design_study_{name}.json"
+        rows = studies.gains(experiments.stored_result(path)["records"])
+        assert studies.gain(rows, "vgds", "penalty-only", 0.0)["high"] < 0
+
+
+def test_readme_states_the_example_and_the_mean():
+    """The caption of its picture: one start, and the ten."""
+    text = " ".join((Path(__file__).parents[1] / "README.md").read_text().split())
+    path = data_dir() / "results" / "design_study_unitree_go2.json"
+    found = {}
+    for record in experiments.stored_result(path)["records"]:
+        if record["origin"] == "start" and record["trust_region"] in (None, 100.0):
+            found.setdefault(record["method"], {})[record["start"]] = record["return"]
+    one = [found[method][3] for method in ("none", "vgds", "penalty-only")]
+    ten = [np.mean(list(found[method].values())) for method in ("none", "vgds", "penalty-only")]
+    for start, end, alone, words in (
+        (*one, "{:.1f} to {:.1f} (penalty alone: {:.1f})"),
+        (*ten, "over ten starts from {:.1f} to {:.1f} ({:.1f})"),
+    ):
+        assert words.format(start, end, alone) in text
+
+
+def test_what_notebook_04_says_of_the_two_critics():
+    path = Path(__file__).parents[1] / "notebooks" / "04_value_gradient_design.ipynb"
+    text = path.read_text()
+    rows, difference = {}, {}
+    for name in ("unitree_go2", "mit_humanoid"):
+        file = data_dir() / "results" / f"critic_tasks_{name}.json"
+        found = [r for r in experiments.stored_result(file)["records"] if "returns" in r]
+        for row in critics.critic_gains(found):
+            rows[name, row["critic"], row["trust_region"]] = row
+        for value in (20.0, 100.0):
+            newer, older = (
+                [r["returns"] for r in found if (r["critic"], r["trust_region"]) == (kind, value)]
+                for kind in ("task of the evaluation", "task of the training")
+            )
+            difference[name, value] = paired_gain(newer, older)
+    assert "finds better bodies at λ = 20 and bodies as good at λ = 100" in text
+    assert difference["unitree_go2", 20.0].low > 0
+    assert difference["unitree_go2", 100.0].low < 0 < difference["unitree_go2", 100.0].high
+    assert "before, all three sizes shrank, now only the height does" in text
+    for value in (20.0, 100.0):
+        newer, older = (
+            rows["unitree_go2", kind, value]
+            for kind in ("task of the evaluation", "task of the training")
+        )
+        assert max(older["size"]) < 0 and min(newer["size"][:2]) > -0.01 and newer["size"][2] < 0
+        assert newer["tracking_error"] < older["tracking_error"]
+    assert "better at λ = 100 and worse at λ = 20, where it makes the robot worse" in text
+    assert difference["mit_humanoid", 100.0].low > 0 > difference["mit_humanoid", 20.0].high
+    assert rows["mit_humanoid", "task of the evaluation", 20.0]["high"] < 0
 
 
 def test_stored_results_belong_to_the_shipped_agents():
