@@ -360,6 +360,26 @@ def test_what_notebook_04_says_of_the_two_critics():
     assert rows["mit_humanoid", "task of the evaluation", 20.0]["high"] < 0
 
 
+def test_what_notebook_02_says_of_the_authors_policies():
+    text = (Path(__file__).parents[1] / "notebooks" / "02_locomotion_task.ipynb").read_text()
+    gains, reference = {}, {}
+    for name in paper.ROBOTS:
+        path = data_dir() / "results" / f"published_policy_{name}.json"
+        first, *starts = experiments.stored_result(path)["records"]
+        starts = np.array([record["returns"] for record in starts])
+        gains[name] = paired_gain(np.broadcast_to(first["returns"], starts.shape), starts)
+        own = experiments.stored_result(data_dir() / "results" / f"design_study_{name}.json")
+        mine = [r for r in own["records"] if (r["origin"], r["method"]) == ("reference", "none")]
+        reference[name] = mine[0]["return"] - first["return"]
+    printed = {name: paper.SINGLE_ROBOT[name]["f_ref"] for name in paper.ROBOTS}
+    assert "For the Go2 and the MIT Humanoid the paper's number lies in our interval" in text
+    assert "for the Golem it is above it" in text
+    for name in ("unitree_go2", "mit_humanoid"):
+        assert gains[name].low < printed[name] < gains[name].high and reference[name] < 0
+    assert printed["golem"] > gains["golem"].high
+    assert "The Golem's earns more than the authors'" in text and reference["golem"] > 0
+
+
 def test_stored_results_belong_to_the_shipped_agents():
     folder = data_dir() / "results"
     seen = set()
