@@ -170,6 +170,12 @@ def require_array(name: str, value, shape=None, *, kinds: str = "fiub", finite: 
     return array
 
 
+def single(array):
+    """A NumPy array as float32; a number beyond its range becomes infinite without a warning."""
+    with np.errstate(over="ignore"):
+        return np.asarray(array, np.float32)
+
+
 def require_shape(name: str, array, shape):
     """The array; ValueError if its shape is another, see `require_array`. For traced ones, too."""
     letters = _is_array(array) and getattr(array.dtype, "kind", "f") in "OSUMm"

@@ -22,6 +22,7 @@ from shapebody.checks import (
     require_list,
     require_seed,
     require_text,
+    single,
 )
 from shapebody.mjcf import build_model, write_mjcf
 from shapebody.parameters import (
@@ -110,8 +111,7 @@ def rotation_axes(generator: np.random.Generator, joint_axes: np.ndarray, num_bo
 
 def published_axes_seed(f) -> int:
     """The generator seed that the published designs derive from their own f [d] (float32)."""
-    with np.errstate(over="ignore"):  # becomes inf, which is told
-        f = require_array("f", require_array("f", f).astype(np.float32))
+    f = require_array("f", single(require_array("f", f)))
     total = abs(float(np.sum(f.astype(np.float64))))
     return int(total * 1e6) ^ 0x5A5A5A5A
 
@@ -233,8 +233,8 @@ class DesignSpace:
                     f"{error}, {self.dim} of them; use a design of robot {self.robot.name!r}, such "
                     "as space.start(0)"
                 ) from None
-        with np.errstate(over="ignore"):  # becomes inf, which is told
-            f = numpy.asarray(f, numpy.float32)
+            f = single(f)
+        f = numpy.asarray(f, numpy.float32)
         if f.ndim == 0 or f.shape[-1] != self.dim:
             raise ValueError(
                 f"design has shape {f.shape}, expected [..., {self.dim}] for robot "

@@ -138,7 +138,7 @@ def check_largest_step(answer, result) -> None:
     if answer is None:
         return
     largest = float(np.abs(np.diff(result.trajectory, axis=0)).max())
-    if abs(answer - np.abs(result.trajectory[-1] - result.trajectory[0]).max()) < 1e-4:
+    if abs(answer - float(np.abs(result.trajectory[-1] - result.trajectory[0]).max())) < 1e-4:
         print("Not yet. That is the change over the whole search; look at single iterations.")
         return
     limit = result.settings["max_update"]
@@ -188,11 +188,6 @@ def check_heavier(f, space, kilograms: float = 1.0) -> None:
     _require_space(space)
     require_number("kilograms", kilograms)
     if _waiting(f, "use the gradient of the total mass at the reference, and a step along it."):
-        return
-    try:
-        f = np.asarray(f, np.float32)
-    except (TypeError, ValueError):
-        print(f"Not yet. The answer is {_shown(f)}; it should be one design [{space.dim}].")
         return
     try:
         f = space.validate(f)

@@ -25,6 +25,7 @@ from shapebody.checks import (
     require_kind,
     require_list,
     require_number,
+    single,
 )
 from shapebody.design import DesignSpace
 from shapebody.files import atomic_write
@@ -139,7 +140,7 @@ def animate_designs(space, trajectory, seconds: float = 4.0, frames: int = 60, h
     require_number("seconds", seconds, 0.01, 3600)
     require_integer("frames", frames, 2, 10_000)
     require_integer("height", height, 16, 8192)
-    trajectory = require_array("trajectory", trajectory).astype(np.float32)
+    trajectory = single(require_array("trajectory", trajectory))
     if trajectory.ndim != 2 or trajectory.shape[1] != space.dim or len(trajectory) < 2:
         raise ValueError(
             f"trajectory has shape {list(trajectory.shape)}, expected [n >= 2, {space.dim}]; "

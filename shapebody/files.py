@@ -61,11 +61,13 @@ def names_path(path: Path):
     try:
         yield
     except OSError as error:
-        if error.errno is None:  # an error of ours
+        if getattr(error, "told", False):  # by a block inside this one
             raise
         full = error.errno in (errno.ENOSPC, errno.EDQUOT)
         fix = "make room on that disk" if full else "give another path"
-        raise type(error)(f"{path} cannot be written: {error.strerror}; {fix}") from error
+        told = type(error)(f"{path} cannot be written: {error.strerror or error}; {fix}")
+        told.errno, told.told = error.errno, True
+        raise told from error
 
 
 def _write(file, data: bytes | str) -> None:

@@ -151,6 +151,12 @@ def main(arguments=None) -> int:
     options = parser().parse_args(arguments)
     failed = 0
     for path in options.notebook:
+        try:
+            require_file("notebook", path)
+        except (ValueError, OSError) as error:
+            print(error, file=sys.stderr)
+            failed += 1
+            continue
         if not options.check:
             print(f"{path} ...", flush=True)
             try:

@@ -1,10 +1,13 @@
 """Wrong arguments of everything public: an error of ours, or accepted on purpose."""
 
+import errno
 import importlib
 import inspect
 import linecache
 import os
 import pkgutil
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -147,10 +150,17 @@ def complaint(error, name, value) -> str:
     words = (name, name.removesuffix("s"), short, checks.shown(value), *WORDS.get(name, ()))
     if not any(word and word in text for word in words):
         return f"names neither argument nor value: {where}"
-    if len(text) > 2500:
+    if len(text) > 2500 and Path(file).name not in WHOLE_VALUES:
         return f"{len(text)} characters: {where}"
     return ""
 
+
+WHOLE_VALUES = ("config.py",)
+"""Modules whose messages show values of any length."""
+UNSETTLED = {
+    "locomotion.config.TaskConfig": ("action_delay", "curriculum_success", "fixed_coefficient")
+}
+"""Fields that take or compare whatever they are given; the functions that use them check them."""
 
 WORDS = {
     "f": ("design",),
@@ -180,6 +190,7 @@ WORDS = {
     "files": ("path",),
     "pytree": ("leaf",),
     "critics": ("agent",),
+    "bodies": ("body",),
     "runs": ("a run",),
 }
 
@@ -189,6 +200,8 @@ def test_wrong_arguments(path, world, capsys):
     kinds, wrong = FUNCTIONS[path], []
     right = {name: kind.value(world) for name, kind in kinds.items()}
     for name, kind in kinds.items():
+        if name in UNSETTLED.get(path, ()):
+            continue
         assert not kind.accepts or kind.why or kind.accepts.issubset(WRONG)
         for label, value in WRONG.items():
             accepted = label in kind.accepts
@@ -203,3 +216,247 @@ def test_wrong_arguments(path, world, capsys):
             if problem:
                 wrong.append(f"{name} = {label}: {problem}")
     assert not wrong, "\n".join(wrong)
+
+
+# ------------------------------------------------------------------ the command line
+
+
+def commands():
+    """(words of a right call by name of its argument, the argument, its action) of every flag."""
+    from shapebody import __main__, notebooks
+
+    def parsers():
+        yield "notebooks", notebooks.main, notebooks.parser()
+        choices = __main__.parser()._subparsers._group_actions[0].choices
+        yield from ((name, __main__.main, parser) for name, parser in choices.items())
+
+    for command, main, parser in parsers():
+        for action in parser._actions:
+            if action.dest != "help":
+                yield pytest.param(command, main, parser, action, id=f"{command}-{action.dest}")
+
+
+WRONG_WORDS = [
+    "",
+    "..",
+    "a/b",
+    "x" * 5000,
+    f"a/{'x' * 5000}",
+    "~nobody_has_this_name/x",
+    "\ud800",
+] + ["nan", "inf", "-inf", "-1", "1.5", str(2**40), str(2**70), "1e300", "None", "b'x'"]
+FINE_WORDS = {
+    "seed": (),
+    "steps": (str(2**40),),  # so many steps can be asked for
+    "hours": ("1.5", "1e300", str(2**40), str(2**70)),
+    "trust_region": ("1.5", "1e300", str(2**40), str(2**70)),
+    "start": (str(2**40),),
+    "episodes": (),
+    "freeze": (),
+    "out": (
+        "a/b",
+        "-1",
+        "-inf",
+        "nan",
+        "inf",
+        "1.5",
+        "1e300",
+        "None",
+        "b'x'",
+        str(2**40),
+        str(2**70),
+    ),
+}
+"""Values that are right: numbers are also names of files."""
+FINE_WORDS["name"] = tuple(word for word in FINE_WORDS["out"] if "/" not in word)
+
+
+@pytest.mark.parametrize("command, main, parser, action", list(commands()))
+def test_wrong_words_on_the_command_line(command, main, parser, action, world, monkeypatch, capsys):
+    """One line that says what was wrong, and no traceback."""
+    from shapebody import evaluation, ppo
+    from shapebody.search import methods
+
+    def worked(*arguments, **options):
+        raise AssertionError("this reached the work")
+
+    monkeypatch.setenv("XLA_FLAGS", "")
+    monkeypatch.setattr(ppo, "Locomotion", worked)
+    monkeypatch.setattr(evaluation, "_environment", worked)
+    monkeypatch.setitem(methods.METHODS, "vgds", methods.METHODS["vgds"]._replace(function=worked))
+    robot, agent = str(world.robot.path), str(world.agent_folder)
+    known = {"robots": robot, "robot": robot, "agent": agent, "notebook": str(world.notebook)}
+    words = [] if command == "notebooks" else [command]
+    for other in parser._actions:
+        if not other.option_strings and other is not action and other.dest in known:
+            words.append(known[other.dest])
+    if command == "design" and action.dest != "agent":
+        words += ["--agent", agent]
+    if action.nargs == 0:  # it takes no value
+        with pytest.raises(SystemExit) as stopped:
+            main([*words, f"{action.option_strings[0]}=x"])
+        assert stopped.value.code == 2
+        return
+    flag = action.option_strings[:1]
+    for word in WRONG_WORDS:
+        if word in FINE_WORDS.get(action.dest, ()):
+            continue
+        # A negative number would be taken for a flag.
+        given = [f"{flag[0]}={word}"] if flag and action.nargs is None else [*flag, word]
+        try:
+            status = main([*words, *given])
+        except SystemExit as stopped:  # argparse, which names the argument
+            status = stopped.code
+        told = capsys.readouterr()
+        said = told.err if command not in ("validate", "notebooks") else told.err + told.out
+        assert status in (1, 2), (word, said)
+        assert "Traceback" not in said and said.strip(), word
+        # argparse shows the whole value, and so does the list of executed notebooks.
+        assert len(said) < 3000 or status == 2 or command == "notebooks", (word, len(said))
+
+
+# ------------------------------------------------------------------ homeless, and a full disk
+
+
+def test_without_a_home_folder(tmp_path):
+    """HOME is not set, and the system does not know the user: nothing crashes, the cache is off."""
+    code = """
+import os, pathlib, pwd
+def nobody(*_):
+    raise KeyError("no such user")
+pwd.getpwuid = pwd.getpwnam = nobody
+import shapebody
+from shapebody import runtime, notebooks
+assert runtime.enable_compilation_cache() is None
+assert len(shapebody.robots()) == 50
+for call in (shapebody.load_robot, shapebody.load_agent):
+    try:
+        call("~/x.xml")
+    except ValueError as error:
+        assert "home folder is unknown" in str(error), error
+from shapebody.__main__ import main
+assert main(["validate", "~/x.xml"]) == 1
+notebooks.problems("a.ipynb")
+print("fine")
+"""
+    environment = {k: v for k, v in os.environ.items() if k not in ("HOME", "XDG_CACHE_HOME")}
+    environment.pop("JAX_COMPILATION_CACHE_DIR", None)
+    import nbformat
+
+    nbformat.write(nbformat.v4.new_notebook(), tmp_path / "a.ipynb")
+    done = subprocess.run(
+        [sys.executable, "-c", code],
+        env=environment | {"PYTHONPATH": str(PACKAGE.parent), "MPLCONFIGDIR": str(tmp_path)},
+        cwd=tmp_path,
+        capture_output=True,
+        text=True,
+    )
+    assert done.stdout.endswith("fine\n"), done.stderr
+
+
+def full(*_):
+    raise OSError(errno.ENOSPC, "No space left on device")
+
+
+WRITERS = {
+    "save_agent": lambda world, path: shapebody.save_agent(world.agent, path),
+    "Report.write": lambda world, path: world.report.write(path),
+    "Scene.save": lambda world, path: world.scene.save(path),
+    "save_arrays": lambda world, path: shapebody.checkpoints.save_arrays(path, {"a": 1.0}),
+    "atomic_write": lambda world, path: shapebody.checkpoints.atomic_write(path, "text"),
+}
+
+
+@pytest.mark.parametrize("writer", WRITERS)
+def test_a_full_disk_is_named(writer, world, tmp_path, monkeypatch):
+    path = tmp_path / "here"
+    monkeypatch.setattr(os, "fsync", full)
+    with pytest.raises(OSError, match="cannot be written: No space left on device") as caught:
+        WRITERS[writer](world, path)
+    assert str(path) in str(caught.value) and caught.value.errno == errno.ENOSPC
+    assert not [file for file in tmp_path.rglob("*") if file.is_file()]
+
+
+def test_a_result_on_a_full_disk_is_named(world, tmp_path, monkeypatch):
+    from shapebody import experiments, paths
+
+    for name in ("results", "checkpoints"):
+        (tmp_path / name).mkdir()
+    monkeypatch.setenv("SHAPEBODY_DATA", str(tmp_path))
+    monkeypatch.setattr(experiments, "provenance", lambda *_, **__: {"seconds": 1.0})
+    monkeypatch.setattr(os, "fsync", full)
+    with pytest.raises(OSError, match="cannot be written") as caught:
+        experiments.result("trial", lambda: [{"a": 1}])
+    assert str(paths.data_dir() / "results" / "trial.json") in str(caught.value)
+
+
+def test_a_folder_that_cannot_be_made_is_named(world, tmp_path):
+    (tmp_path / "file").write_text("")
+    for writer in WRITERS.values():
+        with pytest.raises(OSError, match="cannot be written") as caught:
+            writer(world, tmp_path / "file" / "here")
+        assert str(tmp_path / "file") in str(caught.value)
+
+
+def test_the_command_line_tells_of_a_full_disk(world, tmp_path, monkeypatch, capsys):
+    from shapebody.__main__ import main
+
+    monkeypatch.setattr(os, "fsync", full)
+    out = str(tmp_path / "out.xml")
+    assert main(["validate", str(world.robot.path), "--out", out]) == 1
+    error = capsys.readouterr().err
+    assert (
+        error.startswith(f"shapebody: {out} cannot be written: No space") and "Trace" not in error
+    )
+
+
+# ------------------------------------------------------------------ the checks
+
+
+def test_what_is_shown_is_short():
+    class Silent:
+        def __repr__(self):
+            raise RuntimeError
+
+    assert checks.shown("x" * 5000).endswith("(5,000 characters)")
+    assert checks.shown(Silent()) == "an object of class Silent"
+    for value in WRONG.values():
+        assert len(checks.shown(value)) < 120
+
+
+@pytest.mark.parametrize("name", ["unitree_go2", "my robot (1)", "größe", "x" * 200, "a+b"])
+def test_names_that_are_fine(name):
+    assert checks.require_name("name", name) == name
+
+
+def test_right_values_come_back():
+    import jax
+    import numpy as np
+
+    assert checks.require_integer("n", np.int32(3)) == 3
+    assert checks.require_seed("seed", 2**32 - 1) == 2**32 - 1
+    assert checks.require_number("x", np.float32(0.5), 0, 1) == 0.5
+    assert checks.require_number("x", 3, above=2) == 3
+    assert checks.require_flag("flag", np.True_) is True
+    assert checks.require_list("list", range(2)) == [0, 1]
+    for key in (jax.random.key(0), jax.random.PRNGKey(0)):
+        assert checks.require_key("key", key) is key
+        keys = jax.random.split(key, 3)
+        assert checks.require_key("keys", keys, (3,)) is keys
+    for array, shape in (([1, 2], (2,)), (np.zeros((4, 2, 3)), ("...", 2, 3)), ([[1]], ("n", 1))):
+        assert checks.require_array("array", array, shape).shape == np.shape(array)
+    assert checks.require_path("path", "a/b") == Path("a/b")
+
+
+def test_checks_of_shapes_work_on_traced_arrays():
+    import jax
+    import numpy as np
+
+    from shapebody.ppo import advantages
+
+    rows = np.zeros((2, 3), np.float32)
+    never = rows > 1
+    jitted = jax.jit(lambda x: advantages(x, x, x[:, 0], never, never, 0.9, 0.9))
+    assert jitted(rows).shape == rows.shape
+    with pytest.raises(ValueError, match="last_value has shape"):
+        jax.jit(lambda x: advantages(x, x, x[0], never, never, 0.9, 0.9))(rows)

@@ -27,6 +27,7 @@ from shapebody.checks import (
     require_kind,
     require_list,
     require_number,
+    single,
 )
 from shapebody.descriptions import Descriptions, Sizes, describe, kinematics
 from shapebody.design import DesignSpace, quaternion_product
@@ -342,7 +343,7 @@ class Locomotion:
         D is the largest robot's; numbers beyond a robot's own d are padding and may be anything.
         """
         dim = self.design_dim
-        designs = require_array("designs", designs, finite=False).astype(np.float32)
+        designs = single(require_array("designs", designs, finite=False))
         if designs.shape not in ((dim,), (1, dim), (count, dim)):
             raise ValueError(
                 f"designs have shape {designs.shape}; expected one design [{dim}] or one per "

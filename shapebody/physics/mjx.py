@@ -25,6 +25,7 @@ from shapebody.checks import (
     require_integer,
     require_kind,
     require_shape,
+    single,
 )
 from shapebody.design import MODEL_FIELDS, Embodiment
 from shapebody.physics import MAX_VALUE, MOST_SIMULATIONS, MOST_SUBSTEPS, home_sensordata, prepare
@@ -231,7 +232,7 @@ class MjxPhysics:
 
     def _broadcast(self, name: str, value: jax.Array, size: int) -> jax.Array:
         if not isinstance(value, jax.Array):
-            value = require_array(name, value, finite=False)
+            value = single(require_array(name, value, finite=False))
         value = jnp.asarray(value, self._mjx_data.qpos.dtype)
         if value.shape not in ((self.num_envs, size), (size,)):
             raise ValueError(
