@@ -127,7 +127,7 @@ def require_choice(name: str, value, choices: Iterable):
     """The value; ValueError if it is none of `choices` (texts)."""
     choices = tuple(choices)
     if not isinstance(value, str) or value not in choices:
-        raise refuse(name, value, f"one of {', '.join(map(repr, choices))}")
+        raise refuse(name, value, f"one of {', '.join(choices)}")
     return value
 
 

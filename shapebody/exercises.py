@@ -11,6 +11,7 @@ from shapebody.checks import (
     require_integer,
     require_kind,
     require_number,
+    single,
 )
 
 
@@ -129,11 +130,11 @@ def check_trust_regions(results) -> None:
 
 def check_largest_step(answer, result) -> None:
     """Exercise: the largest change of one design parameter in one iteration of a search."""
+    if _waiting(answer, "the largest change of any parameter between two rows of the trajectory."):
+        return
     from shapebody.search import SearchResult
 
     require_kind("result", result, SearchResult, "shapebody.search(...)")
-    if _waiting(answer, "the largest change of any parameter between two rows of the trajectory."):
-        return
     answer = _number(answer)
     if answer is None:
         return
@@ -159,11 +160,11 @@ def check_total_mass(function, space) -> None:
 
     function: x -> kg, without calling Φ.
     """
-    _require_space(space)
     if not _is_function(
         function, "write a function of x and hand the function over, not a number."
     ):
         return
+    _require_space(space)
     xs = np.array([-1.0, -0.4, 0.0, 0.3, 1.0], np.float32)
     designs = np.zeros((len(xs), space.dim), np.float32)
     designs[:, space.slices["size"]] = xs[:, None]
@@ -185,9 +186,14 @@ def check_total_mass(function, space) -> None:
 
 def check_heavier(f, space, kilograms: float = 1.0) -> None:
     """Exercise: the design nearest to the reference that is `kilograms` heavier."""
+    if _waiting(f, "use the gradient of the total mass at the reference, and a step along it."):
+        return
     _require_space(space)
     require_number("kilograms", kilograms)
-    if _waiting(f, "use the gradient of the total mass at the reference, and a step along it."):
+    try:
+        f = single(require_array("f", f, finite=False))
+    except ValueError:
+        print(f"Not yet. The answer is {_shown(f)}; it should be one design [{space.dim}].")
         return
     try:
         f = space.validate(f)

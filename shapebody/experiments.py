@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from shapebody.checks import (
+    refuse,
     require_array,
     require_choice,
     require_flag,
@@ -111,7 +112,7 @@ def provenance(agent=None, seconds: float | None = None, **config) -> dict:
 
     record = {"config": config, "scale": scale(), **checkpoints.provenance()}
     if agent is not None:
-        checkpoints.require_agent(agent)
+        _require_agent(agent)
         record["agent"] = {
             "name": agent.name,
             "hash": agent.hash,
@@ -289,11 +290,10 @@ def result_path(name: str) -> Path:
 
 
 def _require_agent(agent) -> None:
-    """TypeError if an agent that may be None is something else."""
-    if agent is not None:
-        from shapebody.checkpoints import require_agent
-
-        require_agent(agent)
+    """TypeError if an agent that may be None lacks what tells one from another."""
+    if agent is not None and not all(hasattr(agent, name) for name in ("hash", "states_hash")):
+        hint = "load it with shapebody.load_agent(...)"
+        raise refuse("agent", agent, "an Agent", hint, TypeError)
 
 
 def _require_parts(name: str, parts) -> dict:

@@ -394,7 +394,7 @@ def gain(rows: list[dict], method: str, over: str, trust_region: float | None = 
             return row
     known = ", ".join(f"{r['method']} over {r['over']} at {r['trust_region']}" for r in rows)
     raise ValueError(
-        f"there is no gain of {shown(method)} over {shown(over)} at {trust_region}; "
+        f"there is no gain of {shown(method)[1:-1]} over {shown(over)[1:-1]} at {trust_region}; "
         f"known: {known or 'none'}"
     )
 

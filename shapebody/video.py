@@ -591,10 +591,10 @@ def _check_frames(frames):
 
 def _pictures(name, frames) -> np.ndarray:
     """A picture or a clip; ValueError if it is none."""
-    frames = require_array(name, frames, kinds="u")
+    frames = require_array(name, frames, finite=False)
     right = frames.ndim in (3, 4) and frames.shape[-1] == 3 and frames.dtype == np.uint8
     if not right or 0 in frames.shape:
-        raise refuse(name, frames, "a picture uint8[height, width, 3] or a clip uint8[T, ...]")
+        raise refuse(name, frames, "uint8[height, width, 3], or a clip uint8[T, height, width, 3]")
     return frames
 
 
@@ -637,7 +637,7 @@ def show_image(picture: np.ndarray, width: int | None = None, colours: int | Non
     from IPython.display import Image as Shown
     from IPython.display import display
 
-    picture = require_array("picture", picture, kinds="u")
+    picture = require_array("picture", picture, finite=False)
     if (
         picture.dtype != np.uint8
         or picture.ndim not in (2, 3)

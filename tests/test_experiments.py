@@ -45,7 +45,7 @@ def test_scale_is_read_from_the_environment(monkeypatch):
     monkeypatch.setenv("SHAPEBODY_SCALE", "smoke")
     assert experiments.budget().starts == experiments.BUDGETS["smoke"].starts
     monkeypatch.setenv("SHAPEBODY_SCALE", "huge")
-    with pytest.raises(ValueError, match="huge.*'smoke', 'reduced', 'full'"):
+    with pytest.raises(ValueError, match="huge.*smoke, reduced, full"):
         experiments.scale()
 
 
@@ -208,7 +208,7 @@ def test_gains_of_incomplete_records():
         studies.gains(synthetic(penalty=(6.0, 7.5)))
     with pytest.raises(ValueError, match="0 evaluations of the reference"):
         studies.gains(synthetic()[:9])
-    with pytest.raises(ValueError, match="no gain of 'vgds' over 'start' at 5"):
+    with pytest.raises(ValueError, match="no gain of vgds over start at 5"):
         studies.gain(studies.gains(synthetic()), "vgds", "start", 5.0)
 
 

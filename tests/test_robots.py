@@ -335,7 +335,7 @@ def test_unknown_name_suggests_and_lists():
         load_robot("unitree_go3")
     with pytest.raises(ValueError, match="Available robots: .*golem.*mit_humanoid"):
         load_robot("no such thing")
-    with pytest.raises(TypeError, match="name or a path, got int"):
+    with pytest.raises(TypeError, match="robot is 3; expected a path"):
         load_robot(3)
 
 

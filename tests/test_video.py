@@ -67,7 +67,7 @@ def test_pictures_leave_the_model_alone(model, backend):
 
 
 def test_body_grid(model, backend):
-    grid = video.body_grid([model] * 3, labels="abc", columns=2, height=60, width=80)
+    grid = video.body_grid([model] * 3, labels=list("abc"), columns=2, height=60, width=80)
     assert grid.shape == (2 * (60 + 26), 160, 3)
 
 
