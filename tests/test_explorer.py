@@ -10,12 +10,16 @@ import pytest
 from walker import WALKER
 
 from shapebody import explorer
+from shapebody.design import DesignSpace
 
 
-class Space:
-    """Stands in for a DesignSpace: one parameter, the length of the leg."""
+class Space(DesignSpace):
+    """One parameter, the length of the leg."""
 
     dim = 1
+
+    def __init__(self):
+        pass
     reference = np.zeros(1, np.float32)
 
     def to_model(self, f):
