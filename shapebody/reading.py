@@ -28,7 +28,7 @@ from shapebody.specs import (
     ordered,
     unused,
 )
-from shapebody.urdf import check_urdf, limits_of
+from shapebody.urdf import check_urdf, drop_endless_visuals, limits_of
 from shapebody.urdf import end as _end
 from shapebody.urdf import number as _number
 
@@ -183,7 +183,8 @@ def _prepared_urdf(path: Path, text: str, notes) -> str:
     root = _urdf_root(text)
     if root is None:
         return text
-    notes += check_urdf(path, root)
+    changes = list(drop_endless_visuals(root))
+    notes += changes + check_urdf(path, root)
     dropped = []
     while (link := _empty_root(root)) is not None:
         (joint,) = [joint for joint in root.findall("joint") if _end(joint, "parent") == link]
@@ -193,12 +194,13 @@ def _prepared_urdf(path: Path, text: str, notes) -> str:
             if element.get("name") == link:
                 root.remove(element)
         root.remove(joint)
-    if not dropped:
+    if dropped:
+        notes.append(
+            f"links {listed(dropped)} above {base!r} have no mass, no geometry and nothing else to "
+            f"carry: {base!r} is the base, with its origin as that of the trunk"
+        )
+    if not dropped and not changes:
         return text
-    notes.append(
-        f"links {listed(dropped)} above {base!r} have no mass, no geometry and nothing else to "
-        f"carry: {base!r} is the base, with its origin as that of the trunk"
-    )
     return ElementTree.tostring(root, encoding="unicode")
 
 

@@ -144,7 +144,7 @@ def _scan(
     """
     text = _text(survey, path, named)
     trail = (*trail, os.path.realpath(path))
-    parents: list[tuple[str, float]] = [("", repeated)]  # open elements, and how often each is repeated
+    parents = [("", repeated)]  # open elements, and how often each is repeated
     for line, kind, tag, attributes in _tags(text):
         place = f"<{tag}> in line {line} of {path.name}"
         if kind == "end":
@@ -211,6 +211,8 @@ def _tags(text: str) -> Iterator[tuple[int, str, str, dict[str, str]]]:
             if re.match(r"<!ENTITY|<!DOCTYPE[^\[]*\[", declaration):
                 yield line, "bad", "a document type with entities: write out what they say", {}
             if after < 0:
+                if opening == "<!--":
+                    yield line, "bad", 'a comment that never ends: close it by "-->"', {}
                 return
             position = after
             continue
@@ -314,11 +316,7 @@ def _text(survey: _Survey, path: Path, place: str) -> str:
             raise
         return ""  # MuJoCo says so, with the place
     survey.files[os.path.realpath(path)] = hashlib.sha256(data).hexdigest()
-    text = data.decode("utf-8-sig", errors="replace")
-    if (start := text.rfind("<!--")) > text.rfind("-->"):
-        line = text.count("\n", 0, start) + 1
-        survey.refuse(place, f'has a comment in line {line} that never ends: close it by "-->"')
-    return text
+    return data.decode("utf-8-sig", errors="replace")
 
 
 def _checked(survey: _Survey, path: Path, place: str) -> os.stat_result:

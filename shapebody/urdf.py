@@ -57,6 +57,19 @@ def check_urdf(path: Path, root) -> list[str]:
     return notes
 
 
+def drop_endless_visuals(root) -> Iterator[str]:
+    """Take visuals with numbers that are not finite out of a URDF: a robot needs no looks."""
+    for link in root.findall("link"):
+        for visual in link.findall("visual"):
+            wrong = written(visual)
+            if wrong:
+                link.remove(visual)
+                yield (
+                    f"a visual of link {link.get('name')} cannot be drawn ({listed(wrong)}): it is "
+                    "dropped; to say it yourself correct or remove the <visual>"
+                )
+
+
 def _is_planar(joint) -> bool:
     return joint.get("type") == "planar"
 
@@ -76,10 +89,7 @@ def _check_base(path: Path, root):
         if not _WORLD.match(name):
             continue
         below = [joint for joint in joints if end(joint, "parent") == name]
-        if (
-            name not in children
-            and {joint.get("type") for joint in below} == {"fixed"}
-        ):
+        if name not in children and {joint.get("type") for joint in below} == {"fixed"}:
             fixed = listed(repr(joint.get("name")) for joint in below)
             bases = listed(repr(end(joint, "child")) for joint in below)
             raise ValueError(
