@@ -5,6 +5,7 @@ a shape that is only for looks must not keep a file from being read.
 """
 
 import html
+import itertools
 import re
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Iterator
@@ -100,13 +101,13 @@ def find_meshes(spec, path: Path, files: dict[str, str], notes: list[str]) -> It
         file = html.unescape(files.get(mesh.file, mesh.file))
         parts = Path(file.split("://")[-1].replace("\\", "/")).parts
         ends = [parts[i:] for i in range(len(parts))]
-        places = []
-        if spec.meshdir:
-            # With strippath the end of the path counts, without it the whole path.
-            inner = reversed(ends) if spec.strippath else ends
-            places += [path.parent.joinpath(spec.meshdir, *end) for end in inner]
-        places += [folder.joinpath(*end) for folder in path.parents for end in ends]
-        found = next((place for place in places if place.is_file()), None)
+        # With strippath the end of the path counts, without it the whole path.
+        inner = list(reversed(ends) if spec.strippath else ends) if spec.meshdir else []
+        places = itertools.chain(
+            (path.parent.joinpath(spec.meshdir, *end) for end in inner),
+            (folder.joinpath(*end) for folder in path.parents for end in ends),
+        )
+        found = next((place for place in places if _is_file(place)), None)
         if found is None or found.suffix.lower() not in READABLE:
             kind = "not found" if found is None else f"MuJoCo cannot read {found.suffix} files"
             lost[mesh.name] = file, kind
@@ -122,6 +123,13 @@ def find_meshes(spec, path: Path, files: dict[str, str], notes: list[str]) -> It
             f"{'them' if len(lost) > 1 else 'it'}"
         )
     yield from dropped
+
+
+def _is_file(place: Path) -> bool:
+    try:
+        return place.is_file()
+    except (OSError, ValueError):  # a name that no file can have
+        return False
 
 
 def _shown(lost, kind: str) -> str:

@@ -42,6 +42,7 @@ _COMPUTED = frozenset(
     "cam_pos0 cam_poscom0 cam_mat0 light_pos0 light_poscom0 light_dir0 bvh_aabb oct_aabb "
     "flexedge_length0 flexedge_invweight0".split()
 )
+_ATTRIBUTES = {"qpos0": "ref", "qpos_spring": "springref"}  # of joints, by the fields they go to
 _EXPECTED = f"finite numbers (up to {LARGEST:.1e}, the largest of float32)"
 _SUSPICIOUS = re.compile(r"nan|inf|\de\+?\d\d|\d{38}", re.IGNORECASE)
 _NOT_NUMBERS = frozenset("name class childclass model file text".split())
@@ -67,6 +68,11 @@ def check_numbers(model: mujoco.MjModel) -> Iterator[str]:
         found += _settings(getattr(model.vis, part, None), f"<visual><{part.rstrip('_')}>")
     if not found:
         found += _settings(model.stat, "<statistic>")
+    for field in (*DOF_FIELDS, "jnt_stiffness", "pair_friction"):
+        found += wrong(model, field, lambda x: x < 0, "at least 0")
+    for name in ("density", "viscosity"):
+        if (value := getattr(model.opt, name)) < 0:
+            found.append(f"{name} of <option> is {value:g}: expected at least 0; correct it")
     if not found:
         found += [
             message
@@ -75,8 +81,6 @@ def check_numbers(model: mujoco.MjModel) -> Iterator[str]:
             for message in _not_finite_in(model, name)
         ]
     yield from found
-    for field in (*DOF_FIELDS, "jnt_stiffness"):
-        yield from wrong(model, field, lambda x: x < 0, "at least 0")
 
 
 def check_inertials(spec: mujoco.MjSpec, model: mujoco.MjModel) -> Iterator[str]:
@@ -113,8 +117,9 @@ def wrong(model, field: str, is_wrong: Callable, expected: str) -> Iterator[str]
         if np.any(is_wrong(value)):
             named = found.setdefault(_shown(value, is_wrong), [])
             named.append("the file" if owner is None else owner(index))
+    attribute = _ATTRIBUTES.get(field, field)
     for shown, names in found.items():
-        yield f"{field} of {listed(names)} is {shown}: expected {expected}; correct it"
+        yield f"{attribute} of {listed(names)} is {shown}: expected {expected}; correct it"
 
 
 def _is_floats(value) -> bool:
@@ -130,7 +135,7 @@ def _owner(model, field: str, rows: int) -> Callable[[int], str] | None:
     """What gives the name of a row of a field; None if its rows belong to no named element."""
 
     def named(kind):
-        return lambda i: repr(mujoco.mj_id2name(model, kind, int(i)) or f"number {i}")
+        return lambda i: repr(mujoco.mj_id2name(model, kind, int(i)) or _unnamed(model, kind, i))
 
     joint = named(_OBJ.mjOBJ_JOINT)
     if field in ("qpos0", "qpos_spring"):  # ref and springref
@@ -140,6 +145,14 @@ def _owner(model, field: str, rows: int) -> Callable[[int], str] | None:
         return lambda i: joint(model.dof_jntid[i])
     kind, count = _KINDS.get(prefix, (None, None))
     return named(kind) if kind is not None and getattr(model, count) == rows else None
+
+
+def _unnamed(model, kind, index: int) -> str:
+    """What an element without a name is called: its number, and for a geom its body."""
+    if kind != _OBJ.mjOBJ_GEOM:
+        return f"number {index}"
+    body = mujoco.mj_id2name(model, _OBJ.mjOBJ_BODY, int(model.geom_bodyid[index]))
+    return f"number {index} of body {body}"
 
 
 def _custom(model) -> Iterator[str]:

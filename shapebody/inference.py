@@ -511,7 +511,8 @@ def leg_torque(model) -> float:
     robots of the paper, and is within a factor 2 for 86 %.
     """
     feet = foot_ids(model)
-    weight = model.body_mass[1:].sum() * np.linalg.norm(model.opt.gravity)
+    gravity = np.linalg.norm(model.opt.gravity) or 9.81  # motors are chosen for the earth
+    weight = model.body_mass[1:].sum() * gravity
     return float(weight * leg_length(model, feet) / max(1, len(feet)))
 
 

@@ -28,7 +28,7 @@ from shapebody.specs import (
     ordered,
     unused,
 )
-from shapebody.urdf import check_urdf, limits_of
+from shapebody.urdf import check_urdf, drop_endless_visuals, limits_of
 from shapebody.urdf import end as _end
 from shapebody.urdf import number as _number
 
@@ -109,6 +109,7 @@ _FIXES = {
     "another kind of file",
     "XML parse error": "expected a complete XML file; it may be cut off, so look at the place that "
     "is named",
+    "allocate memory": "its sizes and counts ask for more memory than there is: make them smaller",
     "root element not found": "expected a complete XML file with a <mujoco> or <robot> root",
 }
 
@@ -124,25 +125,36 @@ _TOP_LEVEL = {
 def _explained(error: Exception, kind: str, text: str) -> str:
     """What MuJoCo reports about a file of a kind ("URDF" or "MJCF"), and the fix."""
     reason = " ".join(str(error).split())
-    default = "correct the reported element"
+    default = (
+        "correct the reported element" if "Element" in reason else "correct what the message names"
+    )
     fixes = {**_FIXES, "top level": _TOP_LEVEL[kind]}
     fix = next((fix for part, fix in fixes.items() if part in reason), default)
     root = _urdf_root(text)
     wrong = [] if root is None else written(root)
+    if "bad format" in reason and re.search(r"\$[({]", text):
+        fix = "this is part of a xacro template: expand it with 'xacro FILE > robot.urdf'"
     if wrong:
         fix = f"expected finite numbers, but {listed(wrong)}; correct them"
     return f"MuJoCo reports {reason!r}. {fix[0].upper()}{fix[1:]}"
 
 
+_NO_ELEMENTS = {"<!--": "-->", "<![CDATA[": "]]>", "<?": "?>"}
+
+
 def _without_comments(text: str) -> str:
-    """The text of an XML file without its comments, with the same lines."""
-    parts, start = [], 0
-    while (opening := text.find("<!--", start)) >= 0:
+    """The text of an XML file without its comments, CDATA and instructions, with the same lines."""
+    parts, start, position = [], 0, 0
+    while (opening := text.find("<", position)) >= 0:
+        position = opening + 1
+        word = next((word for word in _NO_ELEMENTS if text.startswith(word, opening)), None)
+        if word is None or text.startswith("<?xml ", opening):
+            continue
         parts.append(text[start:opening])
-        closing = text.find("-->", opening + 4)
+        closing = text.find(_NO_ELEMENTS[word], opening + len(word))
         if closing < 0:
             return "".join(parts)
-        start = closing + 3
+        start = position = closing + len(_NO_ELEMENTS[word])
         parts.append("\n" * text.count("\n", opening, start))
     return "".join([*parts, text[start:]])
 
@@ -171,7 +183,8 @@ def _prepared_urdf(path: Path, text: str, notes) -> str:
     root = _urdf_root(text)
     if root is None:
         return text
-    notes += check_urdf(path, root)
+    changes = list(drop_endless_visuals(root))
+    notes += changes + check_urdf(path, root)
     dropped = []
     while (link := _empty_root(root)) is not None:
         (joint,) = [joint for joint in root.findall("joint") if _end(joint, "parent") == link]
@@ -181,12 +194,13 @@ def _prepared_urdf(path: Path, text: str, notes) -> str:
             if element.get("name") == link:
                 root.remove(element)
         root.remove(joint)
-    if not dropped:
+    if dropped:
+        notes.append(
+            f"links {listed(dropped)} above {base!r} have no mass, no geometry and nothing else to "
+            f"carry: {base!r} is the base, with its origin as that of the trunk"
+        )
+    if not dropped and not changes:
         return text
-    notes.append(
-        f"links {listed(dropped)} above {base!r} have no mass, no geometry and nothing else to "
-        f"carry: {base!r} is the base, with its origin as that of the trunk"
-    )
     return ElementTree.tostring(root, encoding="unicode")
 
 
@@ -203,7 +217,8 @@ def _urdf_root(text: str):
 
 
 def _empty_root(root) -> str | None:
-    """Name of the root link if it is only a frame: no mass, no geometry, one fixed child."""
+    """Name of the root link if it is only a frame: no mass, no geometry, one child that is fixed
+    to it or floats."""
     joints = root.findall("joint")
     children = {_end(joint, "child") for joint in joints}
     tops = [link for link in root.findall("link") if link.get("name") not in children]
@@ -212,8 +227,11 @@ def _empty_root(root) -> str | None:
     below = [joint for joint in joints if _end(joint, "parent") == tops[0].get("name")]
     mass, origin = tops[0].find("inertial/mass"), below[0].find("origin") if below else None
     turn = "0" if origin is None else origin.get("rpy", "0")
+    floats = [joint.get("type") for joint in below] == ["floating"]
+    if floats:
+        turn = "0"  # it has no place of its own
     if (
-        [joint.get("type") for joint in below] != ["fixed"]
+        [joint.get("type") for joint in below] not in (["fixed"], ["floating"])
         or _end(below[0], "child") not in {link.get("name") for link in root.findall("link")}
         or tops[0].find("visual") is not None
         or tops[0].find("collision") is not None

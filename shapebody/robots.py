@@ -28,6 +28,7 @@ FOOT_SPHERE, FOOT_BOX = 0, 1
 PAIR_FRICTION = (1.0, 1.0, 0.005, 0.0001, 0.0001)
 SUFFIXES = (".xml", ".urdf", ".mjcf")
 MIN_MASS, MIN_INERTIA = 1e-7, 1e-11  # kg, kg m²; those of real robots are above 1e-6 and 1e-10
+FAR = 1e4  # m and rad: no robot is there
 MAX_TILT = 45.0  # degrees of the trunk in "home"
 
 _OBJ, _JOINT, _SENSOR = mujoco.mjtObj, mujoco.mjtJoint, mujoco.mjtSensor
@@ -222,30 +223,39 @@ def examine(path: Path) -> tuple[Robot | None, list[str], tuple[str, ...]]:
 def check_tree(model: mujoco.MjModel) -> Iterator[str]:
     """One floating body; every other body hangs from it."""
     free = np.flatnonzero(model.jnt_type == _JOINT.mjJNT_FREE)
+    outermost = np.flatnonzero(model.body_parentid == 0)[1:]  # without the world itself
+    if model.nbody == 1:
+        yield "no bodies: expected a robot; add its trunk, with a <freejoint/>, to the worldbody"
+        return
     if len(free) == 0:
-        base = f" {_name(model, _OBJ.mjOBJ_BODY, 1)}" if model.nbody > 1 else ""
+        base = _name(model, _OBJ.mjOBJ_BODY, 1)
+        held = [_name(model, _OBJ.mjOBJ_JOINT, j) for j in np.flatnonzero(model.jnt_bodyid == 1)]
+        how = f" by {each('joint', held).removeprefix('each of ')}" if held else ""
+        verb = "ties" if held else "fixes"
         yield (
-            f"no free joint: expected exactly one, in the trunk; the file fixes the base{base} to "
-            "the world, as that of an arm on a table, which cannot be used. If the robot walks, "
-            "add <freejoint/> to the first body of the worldbody (in a URDF, make the link of the "
-            "trunk the root)"
+            f"no free joint: expected exactly one, in the trunk; the file {verb} the base {base} "
+            f"to the world{how}, as that of an arm on a table, which cannot be used. If the robot "
+            "walks, add <freejoint/> to the first body of the worldbody, in place of joints that "
+            "tie it to the world (in a URDF, make the link of the trunk the root)"
         )
     elif len(free) > 1:
         bodies = ", ".join(_name(model, _OBJ.mjOBJ_BODY, model.jnt_bodyid[j]) for j in free)
         yield f"{len(free)} free joints (bodies {bodies}): expected exactly one; keep the trunk's"
-    elif model.jnt_bodyid[free[0]] != 1:
-        body = _name(model, _OBJ.mjOBJ_BODY, model.jnt_bodyid[free[0]])
-        yield (
-            f"the free joint is in body {body}: expected it in the first body; "
-            "make the trunk the first body of the worldbody"
-        )
-    loose = [body for body in range(2, model.nbody) if model.body_parentid[body] == 0]
+    floating = model.jnt_bodyid[free]
+    trunk = int(floating[0]) if len(free) == 1 else max(outermost, key=_size_of(model))
+    loose = [int(body) for body in outermost if body != trunk]
     if loose:
         names = (_name(model, _OBJ.mjOBJ_BODY, body) for body in loose)
         yield (
-            f"{each('body', names)} is not part of the robot: "
-            "expected one tree below the trunk; remove or attach what is beside it"
+            f"{each('body', names)} is not part of the robot, whose trunk is "
+            f"{_name(model, _OBJ.mjOBJ_BODY, trunk)}: expected one tree below the trunk; remove or "
+            "attach what is beside it"
         )
+
+
+def _size_of(model: mujoco.MjModel) -> Callable[[int], int]:
+    """Number of bodies in the tree of an outermost body."""
+    return lambda body: int(np.sum(model.body_rootid == body))
 
 
 def check_joints(model: mujoco.MjModel) -> Iterator[str]:
@@ -404,11 +414,28 @@ def check_home(model: mujoco.MjModel) -> Iterator[str]:
         )
     elif height <= 0.01 * standing_height(model, data):
         side = "below" if height < 0 else "above"
+        arm = (
+            ". A chain that stands up from its base is an arm, which cannot be used"
+            if len(feet) == 1 and height < 0
+            else ""
+        )
         yield (
             f"the origin of the trunk {trunk} is {abs(height):.3f} m {side} the lowest foot in "
             '"home": expected it well above, in the trunk; move the origin up, and all that is in '
-            "the trunk down by as much (in a URDF, make the link of the trunk the root)"
+            "the trunk down by as much (in a URDF, make the link of the trunk the root)" + arm
         )
+
+
+def check_poses(model: mujoco.MjModel) -> Iterator[str]:
+    """Positions of keyframes that a robot can have: larger ones leave no digits for the feet."""
+    for key, qpos in enumerate(model.key_qpos):
+        far = np.flatnonzero((np.abs(qpos) > FAR) & is_finite(qpos))
+        if len(far):
+            shown = listed(f"{qpos[i]:g} (number {i + 1})" for i in far)
+            yield (
+                f"qpos of keyframe {_name(model, _OBJ.mjOBJ_KEY, key)} has {shown}: expected at "
+                f"most {FAR:g} m and rad; correct it"
+            )
 
 
 def tilt(qpos) -> float:
@@ -494,6 +521,7 @@ CHECKS: tuple[Callable[[mujoco.MjModel], Iterator[str]], ...] = (
     check_actuators,
     check_ranges,
     check_spheres,
+    check_poses,
     check_custom,
 )
 

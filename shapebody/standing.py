@@ -141,7 +141,9 @@ def warn_standing(robot: Robot, held: Held) -> Iterator[str]:
             f"lower them, or add armature to the joints: {_advised_armature(robot)} is enough"
         )
     elif held.fell and leg_drop(robot) >= FLAT:  # what lies cannot fall
-        if held.sunk > 1:
+        if (held.reversing > CHATTER).any():
+            cause = "Its torques chatter, which is told apart and may be why: correct that first"
+        elif held.sunk > 1:
             cause = (
                 "Only its feet touch the floor, so it fell over and the trunk went through: see "
                 'that "home", the feet, kp and the torque limits are as meant'

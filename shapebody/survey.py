@@ -31,6 +31,7 @@ _MOST = {  # in a robot with all its files; the shipped ones have up to 800 elem
     _BYTES: 2**29,
     "pixels of textures": 2**26,
     "points of height fields": 2**22,
+    "rays of range finders": 10_000,
 }
 _ADVICE = {
     "joints": "one number per joint is written to the completed file, and MuJoCo reads no more; "
@@ -44,6 +45,8 @@ _MOST_OF = {  # attributes of other elements
     ("size", "njmax"): 1e6,
     ("size", "nconmax"): 1e6,
     ("size", "nkey"): 1e4,
+    ("user", "dim"): 1e4,
+    ("contact", "num"): 1e4,
 } | {
     ("option", f"{kind}{name}"): 1e4
     for kind, name in (
@@ -51,7 +54,9 @@ _MOST_OF = {  # attributes of other elements
         ("sdf_", "initpoints"),
     )
 }
-_MOST_PER_USER = 100  # <size nuser_...>: numbers that every element of a kind gets
+_MOST_PER_USER = 100  # <size nuser_...>, user="...": numbers that every element of a kind gets
+_MOST_SAMPLES = 1e4  # nsample: of the history of a sensor or actuator
+_MOST_FOLDERS = 64  # in the name of a file, whose ends are looked for beside and above the file
 _MOST_OF_SHAPE = 256  # <mesh builtin params>: segments
 _MOST_ATTRIBUTES = 200  # per element; MuJoCo searches them one by one
 _LEAST_TIMESTEP = 1e-5  # s
@@ -77,6 +82,8 @@ class _Survey:
     totals: Counter = field(default_factory=Counter)
     documents: dict[str, float] = field(default_factory=dict)
     """Elements of every document by its path."""
+    rays: float = 1
+    """Pixels of the camera that has most, each of which can be a ray of a range finder."""
     files: dict[str, str] = field(default_factory=dict)
     """What tells that a file has changed, by its path."""
 
@@ -117,7 +124,7 @@ def _measure(survey: _Survey, path: Path, trail: tuple[str, ...]) -> float:
     real = os.path.realpath(path)
     if real not in survey.documents:
         document = _Document(path.absolute().parent)
-        trail = _scan(survey, document, path, str(path), trail)
+        trail = _scan(survey, document, path, str(path), trail, 1)
         for place, name in document.assets:
             _weigh(survey, document, place, name)
         sizes = [_measure(survey, file, trail) for _, file in document.models]
@@ -128,11 +135,16 @@ def _measure(survey: _Survey, path: Path, trail: tuple[str, ...]) -> float:
     return survey.documents[real]
 
 
-def _scan(survey, document, path: Path, named: str, trail: tuple[str, ...]) -> tuple[str, ...]:
-    """Add a file, and those that it includes, to a document; returns the files that led to it."""
+def _scan(
+    survey, document, path: Path, named: str, trail: tuple[str, ...], repeated: float
+) -> tuple[str, ...]:
+    """Add a file, and those that it includes, to a document; returns the files that led to it.
+
+    `repeated` is how often what includes the file is repeated.
+    """
     text = _text(survey, path, named)
     trail = (*trail, os.path.realpath(path))
-    parents: list[tuple[str, float]] = [("", 1)]  # open elements, and how often each is repeated
+    parents = [("", repeated)]  # open elements, and how often each is repeated
     for line, kind, tag, attributes in _tags(text):
         place = f"<{tag}> in line {line} of {path.name}"
         if kind == "end":
@@ -159,7 +171,7 @@ def _scan(survey, document, path: Path, named: str, trail: tuple[str, ...]) -> t
             if file and tag == "model":
                 document.models.append((place, file))
             elif file:
-                _scan(survey, document, file, place, trail)
+                _scan(survey, document, file, place, trail, times)
         elif tag == "attach":
             document.attached += times
         elif tag == "compiler":
@@ -199,6 +211,8 @@ def _tags(text: str) -> Iterator[tuple[int, str, str, dict[str, str]]]:
             if re.match(r"<!ENTITY|<!DOCTYPE[^\[]*\[", declaration):
                 yield line, "bad", "a document type with entities: write out what they say", {}
             if after < 0:
+                if opening == "<!--":
+                    yield line, "bad", 'a comment that never ends: close it by "-->"', {}
                 return
             position = after
             continue
@@ -261,6 +275,13 @@ def _check_numbers(survey: _Survey, place: str, tag: str, attributes: dict[str, 
         most = _MOST_OF.get((tag, name))
         if tag == "size" and name.startswith("nuser_"):
             most = _MOST_PER_USER
+        if name == "nsample":
+            most = _MOST_SAMPLES
+        if name == "user" and (count := len(text.split())) > _MOST_PER_USER:
+            survey.refuse(
+                place,
+                f"has {count:,} user numbers: expected at most {_MOST_PER_USER}; remove some",
+            )
         numbers = [_number(text)] if most else []
         if tag == "mesh" and name == "params" and "builtin" in attributes:
             most, numbers = _MOST_OF_SHAPE, [_number(part) for part in text.split()]
@@ -271,6 +292,11 @@ def _check_numbers(survey: _Survey, place: str, tag: str, attributes: dict[str, 
     if tag == "hfield":
         points = _number(attributes.get("nrow", "")) * _number(attributes.get("ncol", ""))
         survey.spend("points of height fields", max(0.0, points), place)
+    if tag == "camera":
+        sides = [max(1.0, _number(part)) for part in attributes.get("resolution", "1").split()]
+        survey.rays = max(survey.rays, math.prod(sides))
+    if tag == "rangefinder" and "camera" in attributes:
+        survey.spend("rays of range finders", survey.rays, place)
     if tag == "texture":
         width, height = (_number(attributes.get(name, "")) for name in ("width", "height"))
         if attributes.get("type") != "2d":
@@ -290,11 +316,7 @@ def _text(survey: _Survey, path: Path, place: str) -> str:
             raise
         return ""  # MuJoCo says so, with the place
     survey.files[os.path.realpath(path)] = hashlib.sha256(data).hexdigest()
-    text = data.decode("utf-8-sig", errors="replace")
-    if (start := text.rfind("<!--")) > text.rfind("-->"):
-        line = text.count("\n", 0, start) + 1
-        survey.refuse(place, f'has a comment in line {line} that never ends: close it by "-->"')
-    return text
+    return data.decode("utf-8-sig", errors="replace")
 
 
 def _checked(survey: _Survey, path: Path, place: str) -> os.stat_result:
@@ -352,3 +374,5 @@ def _weigh(survey: _Survey, document: _Document, place: str, name: str) -> None:
 def _check_name(survey: _Survey, place: str, name: str) -> None:
     if len(name) > 4096:
         survey.refuse(place, f"names a file by {len(name):,} characters; give a shorter name")
+    if (count := name.count("/") + name.count("\\")) > _MOST_FOLDERS:
+        survey.refuse(place, f"names a file in {count:,} folders; give a shorter name")

@@ -14,6 +14,7 @@ from shapebody.specs import each, listed
 def check_urdf(path: Path, root) -> list[str]:
     """Notes on inertias. Raises ValueError for what MuJoCo's importer does not notice."""
     _check_base(path, root)
+    _check_tree(path, root)
     repeated = [
         f"repeated name {name!r} in {kind} ({count} of them)"
         for kind in ("link", "joint")
@@ -35,8 +36,14 @@ def check_urdf(path: Path, root) -> list[str]:
         unit = {"velocity": "rad/s", "effort": "N m"}[attribute]
         reasons.append(
             f"{attribute} of {'joint' if len(joints) == 1 else 'joints'} {listed(joints)} is "
-            f"{value!r}: expected a number ({unit}); write it, or expand the xacro template that "
-            "the file comes from"
+            f"{value!r}: expected a finite number ({unit}); write it, or expand the xacro template "
+            "that the file comes from"
+        )
+    planar = [repr(joint.get("name")) for joint in root.findall("joint") if _is_planar(joint)]
+    if planar:
+        reasons.append(
+            f"{each('joint', planar)} is planar: expected revolute joints; if it holds the base to "
+            "the world, give it the type floating"
         )
     notes, problems = _check_inertias(root)
     reasons += problems
@@ -50,7 +57,27 @@ def check_urdf(path: Path, root) -> list[str]:
     return notes
 
 
-_WORLD = re.compile("(world|ground)(_?(link|frame|plane))?$", re.IGNORECASE)
+def drop_endless_visuals(root) -> Iterator[str]:
+    """Take visuals with numbers that are not finite out of a URDF: a robot needs no looks."""
+    for link in root.findall("link"):
+        for visual in link.findall("visual"):
+            wrong = written(visual)
+            if wrong:
+                link.remove(visual)
+                yield (
+                    f"a visual of link {link.get('name')} cannot be drawn ({listed(wrong)}): it is "
+                    "dropped; to say it yourself correct or remove the <visual>"
+                )
+
+
+def _is_planar(joint) -> bool:
+    return joint.get("type") == "planar"
+
+
+_WORLD = re.compile(
+    "(world|ground|floor|table|pedestal|ceiling)(_?(link|frame|plane))?$", re.IGNORECASE
+)
+_LONGEST = 1000  # links from the root: MuJoCo reads no more, and takes long to say so
 
 
 def _check_base(path: Path, root):
@@ -59,12 +86,10 @@ def _check_base(path: Path, root):
     children = {end(joint, "child") for joint in joints}
     for link in root.findall("link"):
         name = link.get("name") or ""
+        if not _WORLD.match(name):
+            continue
         below = [joint for joint in joints if end(joint, "parent") == name]
-        if (
-            name not in children
-            and _WORLD.match(name)
-            and {joint.get("type") for joint in below} == {"fixed"}
-        ):
+        if name not in children and {joint.get("type") for joint in below} == {"fixed"}:
             fixed = listed(repr(joint.get("name")) for joint in below)
             bases = listed(repr(end(joint, "child")) for joint in below)
             raise ValueError(
@@ -72,6 +97,69 @@ def _check_base(path: Path, root):
                 f"{name!r}, joint {fixed}), as that of an arm on a table: expected a robot that "
                 "walks, with a base that floats. If yours walks, remove that link and that joint"
             )
+
+
+def _check_tree(path: Path, root):
+    """Raises ValueError for links and joints that form no tree, or one that is too deep."""
+    names = [link.get("name") for link in root.findall("link")]
+    joints = [
+        (joint.get("name"), end(joint, "parent"), end(joint, "child"))
+        for joint in root.findall("joint")
+    ]
+    if len(set(names)) < len(names) or None in names:
+        return  # reported as such
+    if not names:
+        raise ValueError(
+            f"{path} has no links: expected the URDF of a robot; if it is made from other files, "
+            "e.g. by xacro, expand it first"
+        )
+    known = set(names)
+    problems = [
+        f"joint {joint!r} has the {kind} {link!r}, which is no link: correct its name, or add the "
+        "link"
+        for joint, *ends in joints
+        for kind, link in zip(("parent", "child"), ends, strict=True)
+        if link not in known
+    ]
+    parents: dict[str, list[tuple[str, str]]] = {}
+    for joint, parent, child in joints:
+        parents.setdefault(child, []).append((joint, parent))
+    problems += [
+        f"link {child!r} is the child of {each('joint', [repr(joint) for joint, _ in above])}: "
+        "expected one, since a robot with closed loops cannot be used; remove the others"
+        for child, above in parents.items()
+        if len(above) > 1
+    ]
+    tops = [name for name in names if name not in parents and name != "world"]
+    tops += ["world"] if "world" in [parent for _, parent, _ in joints] else []
+    if not problems and len(tops) > 1:
+        problems.append(
+            f"links {listed(map(repr, tops))} are no child of a joint: expected one such link, the "
+            "base; connect the others to it by joints, or remove them"
+        )
+    depth = {name: 0 for name in tops}
+    children: dict[str, list[str]] = {}
+    for child, above in parents.items():
+        children.setdefault(above[0][1], []).append(child)
+    waiting = list(tops) if not problems else []
+    while waiting:
+        name = waiting.pop()
+        for child in children.get(name, ()):
+            depth[child] = depth[name] + 1
+            waiting.append(child)
+    circle = [name for name in names if name not in depth and name != "world"]
+    if not problems and circle:
+        problems.append(
+            f"links {listed(map(repr, circle))} are below each other in a circle: expected a tree "
+            "that starts at the base; correct the parents of their joints"
+        )
+    elif not problems and max(depth.values(), default=0) > _LONGEST:
+        problems.append(
+            f"it has a chain of {max(depth.values()):,} links: expected at most {_LONGEST:,}; "
+            "merge links that do not move by themselves"
+        )
+    if problems:
+        raise ValueError(f"{path} is not a valid URDF file: {listed(problems)}")
 
 
 def _check_inertias(root) -> tuple[list[str], list[str]]:

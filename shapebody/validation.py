@@ -27,6 +27,7 @@ from shapebody.standing import (
 )
 
 TILT = 15.0  # degrees of the trunk in "home" above which something is probably wrong
+TURN = 2 * np.pi  # rad
 RANGE_CHANGE = 0.8  # rad: in a design both limits of a joint can move towards each other by half
 
 
@@ -145,10 +146,12 @@ def warn_feet(robot: Robot, held: Held) -> Iterator[str]:
     ends = ends_without_foot(model, robot.home)
     if ends:
         bodies = listed(model.body(body).name for body in ends)
-        geoms = listed(model.geom(group[0]).name for group in ends.values())
+        named = [model.geom(group[0]).name for group in ends.values()]
+        geoms = f" ({listed(named)})" if all(named) else ""
         yield (
             f"bodies {bodies} reach the floor like legs but have no foot, and only feet touch the "
-            f'floor: if these are legs, put "foot" into the names of their lowest geoms ({geoms})'
+            f'floor: if these are legs, put "foot" into the names of their lowest geoms{geoms} (in '
+            'a URDF, fix a link with "foot" at the end of its name to each)'
         )
     if robot.num_feet < 2:
         yield (
@@ -198,15 +201,45 @@ def warn_torque(robot: Robot, held: Held) -> Iterator[str]:
         )
 
 
+def warn_friction(robot: Robot, held: Held) -> Iterator[str]:
+    """Do the joints leave their motors enough torque to turn them?"""
+    model = robot.model
+    dof = robot.qvel_index
+    lost = model.dof_frictionloss[dof] + model.dof_damping[dof]  # N m, at 1 rad/s
+    limits = model.actuator_forcerange[:, 1]
+    stuck = [
+        f"{model.actuator(int(i)).name} ({lost[i]:.3g} of {limits[i]:.3g} N m)"
+        for i in np.flatnonzero(lost > limits)
+    ]
+    if stuck:
+        yield (
+            "friction and damping take more torque at 1 rad/s than the motor has, so that it can "
+            f"hardly turn the joint, at {listed(stuck)}: correct frictionloss, damping or the "
+            "torque limits"
+        )
+
+
 def warn_limits(robot: Robot, held: Held) -> Iterator[str]:
     """Joint limits under design, and the nominal pose within them."""
     model = robot.model
     low, high = model.jnt_range[robot.joints].T
     narrow = [model.joint(int(j)).name for j in robot.joints[high - low < RANGE_CHANGE]]
     if narrow:
+        degrees = (
+            '. Are they in radians, which MJCF reads only with <compiler angle="radian"/>?'
+            if (high - low).max() < np.radians(TURN)
+            else ""
+        )
         yield (
             f"joints {listed(narrow)} have ranges below {RANGE_CHANGE:g} rad: designs can make "
-            "their limits cross, which holds the joint about the middle"
+            f"their limits cross, which holds the joint about the middle{degrees}"
+        )
+    wide = [model.joint(int(j)).name for j in robot.joints[high - low > 3 * TURN]]
+    if wide:
+        yield (
+            f"joints {listed(wide)} have ranges of up to {(high - low).max():.3g} rad, which is "
+            f"{(high - low).max() / TURN:.3g} turns: are they in degrees? Expected radians (in a "
+            'URDF, and in MJCF with <compiler angle="radian"/>)'
         )
     low, high = model.jnt_range[robot.joints[robot.actuated]].T
     outside = np.flatnonzero((robot.nominal < low) | (robot.nominal > high))
@@ -239,6 +272,14 @@ def warn_plausibility(robot: Robot, held: Held) -> Iterator[str]:
         yield f"{mass:.3g} kg and a trunk {height:.3g} m high: are the units kg and m?"
     if not np.allclose(model.opt.gravity, [0, 0, -9.81], atol=0.05):
         yield f"gravity is {model.opt.gravity}: expected 0 0 -9.81"
+    if model.opt.density > 0 and model.opt.wind.any():
+        yield f"wind is {model.opt.wind} m/s: expected none; remove it from <option>"
+    light = [model.body(int(i)).name for i in np.flatnonzero(model.body_gravcomp)]
+    if light:
+        yield (
+            f"gravity is compensated at bodies {listed(light)}: the legs carry less than their "
+            "weight, as on no real robot; remove gravcomp"
+        )
     gap = _gap(robot)
     if abs(gap) > FLOOR_TOLERANCE * height:
         yield f'the lowest foot of "home" is {gap:+.3f} m from the floor: correct the trunk height'
@@ -267,6 +308,7 @@ WARNINGS = (
     warn_gains,
     warn_feet,
     warn_torque,
+    warn_friction,
     warn_limits,
     warn_plausibility,
 )

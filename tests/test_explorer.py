@@ -20,6 +20,7 @@ class Space(DesignSpace):
 
     def __init__(self):
         pass
+
     reference = np.zeros(1, np.float32)
 
     def to_model(self, f):

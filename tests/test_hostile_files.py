@@ -104,9 +104,24 @@ REFUSED = {
     "iterations": ({"before": '<option iterations="2000000000"/>'}, "iterations="),
     "timestep": ({"before": '<option timestep="1e-12"/>'}, "timestep 1e-12"),
     "plugin": ({"before": '<extension><plugin plugin="mujoco.pid"/></extension>'}, "plugin"),
-    "open comment": ({"after": "<!-- a -->\n<!-- b"}, "comment in line 2 that never ends"),
+    "open comment": ({"after": "<!-- a -->\n<!-- b"}, "line 2, has a comment that never ends"),
     "a device as mesh": (asset('<mesh name="m" file="/dev/zero"/>'), "/dev/zero.* a device"),
     "a device as include": ({"before": '<include file="/dev/zero"/>'}, "/dev/zero.* a device"),
+    "user numbers": (
+        {"inside": f'<geom size="1" user="{"1 " * 101}"/>'},
+        "101 user numbers: expected at most 100",
+    ),
+    "user sensor": ({"after": '<sensor><user dim="2000000000"/></sensor>'}, "dim='2000000000'"),
+    "contact sensor": ({"after": '<sensor><contact num="1e9"/></sensor>'}, "num="),
+    "samples": ({"after": '<sensor><clock nsample="9e9"/></sensor>'}, "nsample="),
+    "rays": (
+        {
+            "inside": '<camera name="c" resolution="4000 4000"/>',
+            "after": '<sensor><rangefinder camera="c"/></sensor>',
+        },
+        "16,000,000 rays of range finders",
+    ),
+    "folders": (asset(f'<mesh name="m" file="{"a/" * 500}"/>'), "in 500 folders"),
     "a long file name": (asset(f'<mesh name="m" file="{"a/" * 9_999}"/>'), "19,998 characters"),
 }
 
@@ -166,6 +181,12 @@ def test_attached_models_multiply(tmp_path):
         (tmp_path / f"{i}.xml").write_text(text.format(i - 1, twice))
     read(tmp_path / "2.xml")
     assert "elements" in refusal(tmp_path / "11.xml")
+
+
+def test_repeated_includes_multiply(tmp_path):
+    (tmp_path / "many.xml").write_text("<mujocoinclude>" + "<geom size='1'/>" * 300)
+    repeated = '<replicate count="300"><include file="many.xml"/></replicate>'
+    assert "elements" in refusal(small(tmp_path, inside=repeated))
 
 
 def test_an_honest_include(tmp_path):

@@ -1,5 +1,6 @@
 """Importing: what is beside the point in a file costs nothing, and feet are what bears weight."""
 
+import itertools
 import struct
 
 import mujoco
@@ -140,6 +141,7 @@ def assert_same(robot, plain):
         '<!-- <robot name="old"> <link name="base"/> -->',
         '<!-- <mujoco><compiler meshdir="x"/></mujoco> -->',
         "<!-- <include file='x'/> > --><!---->",
+        "<!-- <![CDATA[ --><?xacro <xacro:leg/> ?>",
     ],
 )
 def test_comments_say_nothing(tmp_path, plain, comment):
@@ -166,6 +168,19 @@ def test_namespaces_say_nothing(tmp_path, plain, old, new):
     assert list(robot.velocity_limits[:2]) in ([10, 10], [15, 15])
 
 
+def test_what_plugins_hold_says_nothing(tmp_path, plain):
+    extra = "<gazebo><![CDATA[ <xacro:leg/> <link name='a'/> <!-- ]]></gazebo>"
+    assert_same(load_robot(biped(tmp_path, extra=extra)), plain)
+
+
+@pytest.mark.parametrize("expression", ["${width}", "$(arg width)"])
+def test_expressions_of_a_template_are_named(tmp_path, expression):
+    path = biped(tmp_path)
+    path.write_text(path.read_text().replace('xyz="0 0.1 0"', f'xyz="0 {expression} 0"'))
+    with pytest.raises(ValueError, match="part of a xacro template: expand it"):
+        load_robot(path)
+
+
 def test_a_template_is_a_template(tmp_path):
     path = biped(tmp_path, extra="<!-- a --><xacro:leg/><!-- b -->")
     with pytest.raises(ValueError, match="xacro template"):
@@ -181,6 +196,9 @@ ZERO = {
     "sphere": '<sphere radius="0"/>',
     "cylinder": '<cylinder radius="0.1" length="0"/>',
     "no number": '<box size="nan 1 1"/>',
+    "endless": '<sphere radius="inf"/>',
+    "endless mesh": '<mesh filename="shank.stl" scale="1e39 1 1"/>',
+    "long name": f'<mesh filename="{"a" * 300}.stl"/>',
     "too few": '<box size="1 1"/>',
     "letters": '<box size="a b c"/>',
     "nothing": "",
@@ -561,3 +579,59 @@ def test_a_leg_unlike_its_partner_is_a_leg(tmp_path):
     path = tmp_path / "walker.xml"
     path.write_text(text)
     assert load_robot(path).num_feet == 4
+
+
+# Links and joints.
+
+
+@pytest.mark.parametrize("parent", ["world", "odom", "base_footprint"])
+@pytest.mark.parametrize("between", [False, True])
+def test_a_base_below_a_floating_joint(tmp_path, plain, parent, between):
+    floating = FIXED.replace('"fixed"', '"floating"')
+    extra = f'<link name="{parent}"/>'
+    if between:
+        extra += '<link name="frame"/>'
+        extra += floating.format(parent=parent, child="frame", xyz="0 0 1")
+        extra += FIXED.format(parent="frame", child="base", xyz="0 0 0.6")
+    else:
+        extra += floating.format(parent=parent, child="base", xyz="0 0 1")
+    robot = load_robot(biped(tmp_path, extra=extra))
+    assert_same(robot, plain)
+    assert robot.model.body(1).name == "base" and robot.home[2] == plain.home[2]
+
+
+NO_TREE = {
+    "planar": ('<link name="odom"/>' + FIXED.replace('"fixed"', '"planar"'), "odom base", "planar"),
+    "table": ('<link name="table"/>' + FIXED, "table base", "fixes the base 'base' to the world"),
+    "no such link": (FIXED, "base hand", "has the child 'hand', which is no link"),
+    "two bases": ('<link name="spare"/>', None, "are no child of a joint"),
+    "circle": (FIXED, "l_sole base", "in a circle"),
+    "own parent": ('<link name="q"/>' + FIXED, "q q", "'q' are below each other in a circle"),
+    "two parents": (FIXED, "r_shin l_sole", "'l_sole' is the child of each of joints"),
+}
+
+
+@pytest.mark.parametrize("case", NO_TREE)
+def test_links_that_are_no_tree(tmp_path, case):
+    extra, ends, message = NO_TREE[case]
+    parent, child = ends.split() if ends else ("", "")
+    (problem,) = validate_robot(
+        biped(tmp_path, extra=extra.format(parent=parent, child=child, xyz="0 0 1"))
+    ).problems
+    assert message in problem and "MuJoCo reports" not in problem
+
+
+def test_a_chain_of_links_that_is_too_long(tmp_path):
+    chain = ["base", *(f"c{i}" for i in range(1100))]
+    extra = "".join(f'<link name="{name}"/>' for name in chain[1:])
+    for parent, child in itertools.pairwise(chain):
+        extra += FIXED.format(parent=parent, child=child, xyz="0 0 0")
+    (problem,) = validate_robot(biped(tmp_path, extra=extra)).problems
+    assert "a chain of 1,100 links: expected at most 1,000" in problem
+
+
+def test_what_to_do_about_a_leg_without_a_foot(tmp_path):
+    path = biped(tmp_path, frame=("sole", "0 0 -0.04", ""))
+    path.write_text(path.read_text().replace("r_foot", "r_frame"))
+    (text,) = [text for text in validate_robot(path).warnings if "have no foot" in text]
+    assert "r_sole" in text and "unnamed" not in text and 'a link with "foot"' in text

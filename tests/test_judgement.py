@@ -225,6 +225,78 @@ def test_an_mjcf_without_a_free_joint_is_fixed_to_the_world(tmp_path):
     assert "the file fixes the base 'trunk' to the world" in problem and "<freejoint/>" in problem
 
 
+def test_a_base_that_joints_hold(tmp_path):
+    held = '<joint name="rail" axis="0 1 0" range="-1 1"/>'
+    path = own_robot(tmp_path, ("<freejoint/>", held), (KEY, '<key name="home"/>'))
+    (problem,) = validate_robot(path).problems
+    assert "ties the base 'trunk' to the world by joint 'rail'" in problem
+
+
+@pytest.mark.parametrize("beside", ['mocap="true"', 'pos="1 0 1"'])
+def test_what_is_beside_the_robot_is_named(tmp_path, beside):
+    body = f'<worldbody><body name="ball" {beside}><geom size="0.1"/></body>'
+    (problem,) = validate_robot(own_robot(tmp_path, ("<worldbody>", body))).problems
+    assert "body 'ball' is not part of the robot, whose trunk is 'trunk'" in problem
+    free = body.replace("<geom", "<freejoint/><geom").replace(' mocap="true"', "")
+    path = own_robot(tmp_path, ("<worldbody>", free), (KEY, '<key name="home"/>'))
+    several, loose = validate_robot(path).problems
+    assert "2 free joints" in several and "body 'ball' is not part" in loose
+
+
+def test_a_file_without_bodies(tmp_path):
+    path = tmp_path / "empty.xml"
+    path.write_text("<mujoco/>")
+    assert "no bodies" in validate_robot(path).problems[0]
+
+
+def test_an_arm_that_stands_up_is_called_one(tmp_path):
+    path = tmp_path / "arm.xml"
+    path.write_text(
+        """<mujoco><worldbody><body name="base"><freejoint/><geom size="0.1"/>
+        <body><joint axis="0 1 0" range="-60 60"/><geom size="0.03" pos="0 0 0.5"/></body>
+        </body></worldbody></mujoco>"""
+    )
+    (problem,) = validate_robot(path).problems
+    assert "below the lowest foot" in problem and "is an arm" in problem
+
+
+# Numbers that can be used but hardly are meant.
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "part"),
+    [
+        (" range", ' frictionloss="7" range', "friction and damping take more torque"),
+        (" range", ' damping="1e6" range', "friction and damping take more torque"),
+        ("<worldbody>", '<option wind="9 0 0" density="1.2"/><worldbody>', "wind is [9. 0. 0.]"),
+        ('name="trunk"', 'name="trunk" gravcomp="1"', "compensated at bodies trunk"),
+        ('range="-3 3"', 'range="-180 180"', "are they in degrees?"),
+        ('<compiler angle="radian"/>', "", "Are they in radians"),
+    ],
+)
+def test_what_is_hardly_meant_is_asked(tmp_path, old, new, part):
+    path = walker(tmp_path)
+    assert not warning(path, part)
+    path.write_text(path.read_text().replace(old, new))
+    assert warning(path, part)
+
+
+def test_limits_without_gravity_are_those_on_earth(tmp_path):
+    path = walker(tmp_path, motors='<motor joint="{0}"/>')
+    limits = load_robot(path).model.actuator_forcerange.copy()
+    path.write_text(path.read_text().replace("<worldbody>", '<option gravity="0 0 0"/><worldbody>'))
+    np.testing.assert_allclose(load_robot(path).model.actuator_forcerange, limits)
+    assert warning(path, "gravity is") and not warning(path, "a placeholder?")
+
+
+def test_what_chatters_is_not_called_usual(tmp_path):
+    path = walker(tmp_path, motors='<position joint="{0}" kp="30" kv="1" forcerange="-20 20"/>')
+    path.write_text(path.read_text().replace('armature="0.01"', ""))
+    assert warning(path, "chatters")
+    fall = warning(path, "falls out of its nominal pose")
+    assert "chatter" in fall and "usual" not in fall
+
+
 LIMIT = 'effort="60" velocity="12"'
 
 
@@ -377,8 +449,8 @@ NUMBERS = {  # place in the file -> element with a number, and what the message 
     "solimp": ('type="plane"', 'type="plane" solimp="0.9 {}"', "geom_solimp of 'floor'"),
     "friction": ('name="left_foot"', 'name="left_foot" friction="{}"', "friction of 'left_foot'"),
     "solreflimit": (RIGHT_HIP, RIGHT_HIP[:-2] + ' solreflimit="{} 1"/>', "solref of 'right_hip'"),
-    "springref": (RIGHT_HIP, RIGHT_HIP[:-2] + ' springref="{}"/>', "qpos_spring of 'right_hip'"),
-    "ref": (RIGHT_HIP, RIGHT_HIP[:-2] + ' ref="{}"/>', "qpos0 of 'right_hip'"),
+    "springref": (RIGHT_HIP, RIGHT_HIP[:-2] + ' springref="{}"/>', "springref of 'right_hip'"),
+    "ref": (RIGHT_HIP, RIGHT_HIP[:-2] + ' ref="{}"/>', "ref of 'right_hip'"),
     "margin": (RIGHT_HIP, RIGHT_HIP[:-2] + ' margin="{}"/>', "jnt_margin of 'right_hip'"),
     "axis": (RIGHT_HIP, RIGHT_HIP.replace("0 1 0", "0 {} 0"), "right_hip'"),
     "gear": (RIGHT_ACTUATOR, RIGHT_ACTUATOR[:-2] + ' gear="{}"/>', "gear of 'right_hip'"),
@@ -410,6 +482,32 @@ def test_numbers_are_finite_in_float32(tmp_path, case, value):
     shown = text.replace("1.e+39", "1e39").replace("1e+39", "1e39")
     # MuJoCo makes a vector of length 1 of an axis.
     assert value.lstrip("-") in shown or (case == "axis" and "nan" in shown)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ("<worldbody>", '<option viscosity="-1"/><worldbody>', "viscosity of <option> is -1"),
+        ("<worldbody>", '<option density="-1"/><worldbody>', "density of <option> is -1"),
+        (RIGHT_HIP, RIGHT_HIP[:-2] + ' armature="-1"/>', "dof_armature of 'right_hip' is -1"),
+    ],
+)
+@pytest.mark.filterwarnings("ignore")
+def test_numbers_below_zero_are_told_alone(tmp_path, old, new, message):
+    (problem,) = validate_robot(own_robot(tmp_path, (old, new))).problems
+    assert message in problem and "at least 0" in problem
+
+
+@pytest.mark.parametrize("index", [2, 7])
+def test_a_home_of_no_robot(tmp_path, index):
+    robot = load_robot(walker(tmp_path))
+    qpos = robot.home.copy()
+    qpos[index] = 1e30
+    path = walker(tmp_path)
+    key = f'<keyframe><key name="home" qpos="{" ".join(map(str, qpos))}"/></keyframe></mujoco>'
+    path.write_text(path.read_text().replace("</mujoco>", key))
+    (problem,) = validate_robot(path).problems
+    assert f"qpos of keyframe 'home' has 1e+30 (number {index + 1})" in problem
 
 
 def test_large_numbers_and_names_like_numbers_are_fine(tmp_path):

@@ -400,7 +400,7 @@ BAD = {
     ),
     "trunk is not the first body": (
         [("<worldbody>", '<worldbody><body name="table"><geom size="1"/></body>')],
-        "free joint is in body 'trunk': expected it in the first body",
+        "body 'table' is not part of the robot, whose trunk is 'trunk'",
     ),
     "loose body": (
         [("</worldbody>", '<body name="table"><geom size="1"/></body></worldbody>')],
