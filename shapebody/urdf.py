@@ -14,7 +14,6 @@ from shapebody.specs import each, listed
 def check_urdf(path: Path, root) -> list[str]:
     """Notes on inertias. Raises ValueError for what MuJoCo's importer does not notice."""
     _check_base(path, root)
-    _check_tree(path, root)
     repeated = [
         f"repeated name {name!r} in {kind} ({count} of them)"
         for kind in ("link", "joint")
@@ -34,10 +33,14 @@ def check_urdf(path: Path, root) -> list[str]:
         )
     for (attribute, value), joints in wrong.items():
         unit = {"velocity": "rad/s", "effort": "N m"}[attribute]
+        expected = (
+            f"a number ({unit}); write it, or expand the xacro template that the file comes from"
+            if np.isnan(number(value))
+            else f"a finite number ({unit}); correct it, or write 0 for no limit"
+        )
         reasons.append(
             f"{attribute} of {'joint' if len(joints) == 1 else 'joints'} {listed(joints)} is "
-            f"{value!r}: expected a finite number ({unit}); write it, or expand the xacro template "
-            "that the file comes from"
+            f"{value!r}: expected {expected}"
         )
     planar = [repr(joint.get("name")) for joint in root.findall("joint") if _is_planar(joint)]
     if planar:
@@ -54,6 +57,7 @@ def check_urdf(path: Path, root) -> list[str]:
             reasons.append(f"expected finite numbers, but {listed(found)}; correct them")
     if reasons:
         raise ValueError(f"{path} is not a valid URDF file: {'; '.join(reasons)}")
+    _check_tree(path, root)
     return notes
 
 
