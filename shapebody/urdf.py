@@ -119,8 +119,10 @@ def _check_tree(path: Path, root):
         )
     known = set(names)
     problems = [
-        f"joint {joint!r} has the {kind} {link!r}, which is no link: correct its name, or add the "
-        "link"
+        f"joint {joint!r} has no <{kind} link>: add it"
+        if link is None
+        else f"joint {joint!r} has the {kind} {link!r}, which is no link: correct its name, or add "
+        "the link"
         for joint, *ends in joints
         for kind, link in zip(("parent", "child"), ends, strict=True)
         if link not in known
