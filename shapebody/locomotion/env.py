@@ -272,7 +272,7 @@ class Locomotion:
         """Start all environments and return their state.
 
         Args:
-            key: PRNG key.
+            key: PRNG key; None where `keys` are given.
             designs: normalized designs, one [d] or one per environment [N, d] (padded to
                 the largest robot's d); None draws them from U(-rc, rc) (`design_radius`).
             coefficient: curriculum coefficient c in [0, 1] of every environment.
@@ -287,11 +287,10 @@ class Locomotion:
         n = self.num_envs
         require_number("coefficient", coefficient, 0, 1)
         require_flag("spread", spread)
-        require_key("key", key)
         if keys is not None:
             require_key("keys", keys, (n,))
         else:
-            keys = jax.random.split(key, n)
+            keys = jax.random.split(require_key("key", key), n)
         coefficients = jnp.full(n, coefficient, jnp.float32)
         streaks = jnp.zeros(n, jnp.int32)
         if designs is None:
