@@ -148,12 +148,14 @@ UNCHECKED |= dict.fromkeys(
 UNCHECKED |= dict.fromkeys(
     (
         f"robots.check_{name}"
-        for name in "actuators custom feet home joints loops masses ranges spheres tree".split()
+        for name in (
+            "actuators custom feet home joints loops masses poses ranges spheres tree"
+        ).split()
     ),
     ON_MODEL,
 )
 UNCHECKED |= dict.fromkeys(
-    (f"validation.warn_{x}" for x in "feet limits plausibility torque".split()),
+    (f"validation.warn_{x}" for x in "feet friction limits plausibility torque".split()),
     "one of the checks of a robot, called by `validate_robot`",
 )
 UNCHECKED |= dict.fromkeys(
@@ -517,7 +519,7 @@ FUNCTIONS = {
     ),
     "locomotion.env.Locomotion.physics_arrays": {},
     "locomotion.env.Locomotion.reset": dict(
-        key=KEY,
+        key=optional(KEY),
         designs=optional(DESIGN),
         coefficient=PROBABILITY,
         spread=FLAG,

@@ -287,10 +287,12 @@ class Locomotion:
         n = self.num_envs
         require_number("coefficient", coefficient, 0, 1)
         require_flag("spread", spread)
+        if key is not None or keys is None:
+            require_key("key", key)
         if keys is not None:
             require_key("keys", keys, (n,))
         else:
-            keys = jax.random.split(require_key("key", key), n)
+            keys = jax.random.split(key, n)
         coefficients = jnp.full(n, coefficient, jnp.float32)
         streaks = jnp.zeros(n, jnp.int32)
         if designs is None:
