@@ -480,7 +480,7 @@ def test_bad_configs(make, message):
 
 def test_wrong_input_width():
     descriptions, observation = random_inputs(10)
-    with pytest.raises(ValueError, match="general has 12 columns; expected 13"):
+    with pytest.raises(ValueError, match=r"general has shape \(12,\); expected \[\.\.\., 13\]"):
         outputs(
             NETWORKS["policy"],
             initialize(NETWORKS["policy"], jax.random.key(0)),
