@@ -382,7 +382,10 @@ def test_errors(agent, robot, space, tmp_path):
         (dict(batch_size=0), "batch_size is 0"),
         (dict(steps=3), "no setting 'steps'; its settings are iterations, learning_rate"),
         (dict(robot=tiny_robot(tmp_path, 3), f=None), "no states with the 3 joints"),
-        (dict(states=jax.tree.map(lambda x: x[:, :1], agent.states)), "needs at least one state"),
+        (
+            dict(states=jax.tree.map(lambda x: x[:, :1], agent.states)),
+            r"states.general has shape \(24, 1\); expected \[M, 13\]",
+        ),
     ]
     for changes, message in cases:
         arguments = dict(method="vgds", agent=agent, robot=robot, f=f) | changes
