@@ -45,9 +45,9 @@ def engine():
     import jax
     import numpy as np
 
-    from shapebody.design import DesignSpace
+    from shapebody.design.space import DesignSpace
     from shapebody.physics.native import NativePhysics
-    from shapebody.robots import load_robot
+    from shapebody.robot.robot import load_robot
 
     robot = load_robot(ROBOT)
     space = DesignSpace(robot)
@@ -74,8 +74,8 @@ def engine():
 def _environment(engine, count, length):
     import jax
 
-    from shapebody.locomotion import Locomotion
-    from shapebody.robots import load_robot
+    from shapebody.robot.robot import load_robot
+    from shapebody.task.env import Locomotion
 
     def act(params, key, descriptions, observation):
         return 0.3 * jax.random.normal(key, observation.joints.shape[:-1]), ()
@@ -127,8 +127,9 @@ def fifty():
     """Training on all shipped robots at once, with the reduced networks: speed and memory."""
     import resource
 
-    from shapebody.ppo import TrainConfig, Trainer
-    from shapebody.robots import robots
+    from shapebody.robot.robot import robots
+    from shapebody.training.config import TrainConfig
+    from shapebody.training.trainer import Trainer
 
     config = TrainConfig.reduced(
         ROBOT, robots=tuple(robots()), name="fifty", num_envs=400, minibatch_size=3200
@@ -168,7 +169,8 @@ def mjx():
 
 def training():
     """Training end to end at scale reduced: actor and learner together."""
-    from shapebody.ppo import TrainConfig, Trainer
+    from shapebody.training.config import TrainConfig
+    from shapebody.training.trainer import Trainer
 
     with tempfile.TemporaryDirectory() as folder:
         trainer = Trainer(TrainConfig.reduced(ROBOT), folder)
@@ -184,10 +186,10 @@ def search():
     """VGDS with the shipped agent, after compilation."""
     import numpy as np
 
-    from shapebody.checkpoints import load_agent
-    from shapebody.design import DesignSpace
-    from shapebody.robots import load_robot
-    from shapebody.search import search
+    from shapebody.agent.store import load_agent
+    from shapebody.design.space import DesignSpace
+    from shapebody.optimizers.search import search
+    from shapebody.robot.robot import load_robot
 
     robot, agent = load_robot(ROBOT), load_agent(ROBOT)
     space = DesignSpace(robot)
@@ -204,13 +206,13 @@ def baselines():
     single-robot experiments. BO, where BoTorch is installed, for one of them: it takes minutes."""
     import numpy as np
 
-    from shapebody import paper
-    from shapebody.checkpoints import load_agent
-    from shapebody.design import DesignSpace
-    from shapebody.experiments import trained_robots
-    from shapebody.robots import load_robot
-    from shapebody.search import search
-    from shapebody.studies import METHOD_RUNS, installed
+    from shapebody.agent.store import load_agent
+    from shapebody.design.space import DesignSpace
+    from shapebody.optimizers.search import search
+    from shapebody.reproduction import paper
+    from shapebody.reproduction.design_study import METHOD_RUNS, installed
+    from shapebody.reproduction.scale import trained_robots
+    from shapebody.robot.robot import load_robot
 
     rows = {}
     for name in trained_robots(paper.ROBOTS):
@@ -273,7 +275,7 @@ def main():
         enable_compilation_cache()
         print(json.dumps(BENCHMARKS[options.names[0]]()))
         return
-    from shapebody.experiments import provenance
+    from shapebody.reproduction.results import provenance
 
     source = provenance(robot=ROBOT, environments=ENVIRONMENTS)
     for name in options.names or BENCHMARKS:

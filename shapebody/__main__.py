@@ -112,8 +112,10 @@ def main(arguments=None) -> int:
 
 
 def _train(options):
-    from shapebody.experiments import scale
-    from shapebody.ppo import TrainConfig, as_continued, train
+    from shapebody.reproduction.scale import scale
+    from shapebody.training.config import TrainConfig
+    from shapebody.training.run_state import as_continued
+    from shapebody.training.train import train
 
     changes = {"robots": tuple(options.robots)}
     if options.name is not None:
@@ -134,13 +136,13 @@ def _train(options):
 
 def _seconds(options) -> float | None:
     """--hours in seconds."""
-    from shapebody.checks import require_number
+    from shapebody.arguments import require_number
 
     return None if options.hours is None else 3600 * require_number("--hours", options.hours, 0)
 
 
 def _anneal(options):
-    from shapebody.ppo import anneal
+    from shapebody.training.train import anneal
 
     agent = anneal(
         options.agent,
@@ -156,9 +158,9 @@ def _anneal(options):
 
 
 def _sharpen(options):
-    from shapebody.checkpoints import agent_folder, load_agent
-    from shapebody.networks import CriticConfig
-    from shapebody.ppo import train_critic
+    from shapebody.agent.store import agent_folder, load_agent
+    from shapebody.networks.config import CriticConfig
+    from shapebody.training.policy_evaluation import train_critic
 
     seconds, agent = _seconds(options), load_agent(options.agent)
     full = agent.metadata.get("scale") == "full"
@@ -181,12 +183,13 @@ def _sharpen(options):
 def _design(options):
     import numpy as np
 
-    from shapebody.advice import large_changes
-    from shapebody.checkpoints import load_agent
-    from shapebody.design import DesignSpace
+    from shapebody.agent.store import load_agent
+    from shapebody.analysis.advice import large_changes
+    from shapebody.design.space import DesignSpace
     from shapebody.files import atomic_write
-    from shapebody.robots import load_robot
-    from shapebody.search import Objective, search
+    from shapebody.optimizers.objective import Objective
+    from shapebody.optimizers.search import search
+    from shapebody.robot.robot import load_robot
 
     robot = load_robot(options.robot)
     _check_out(options.out, robot)
@@ -213,7 +216,7 @@ def _design(options):
 
 def _check_out(out, robot) -> None:
     """Before a search: whether its result can be written."""
-    from shapebody.checks import require_output
+    from shapebody.arguments import require_output
 
     if out is None:
         return
@@ -246,8 +249,8 @@ def _warn_of_another_robot(agent, robot) -> None:
 
 
 def _validate(options) -> int:
-    from shapebody.checks import require_output
-    from shapebody.validation import validate_robot
+    from shapebody.arguments import require_output
+    from shapebody.robot.report import validate_robot
 
     if options.out is not None:
         require_output("--out", options.out)
@@ -259,10 +262,10 @@ def _validate(options) -> int:
 
 
 def _evaluate(options):
-    from shapebody.checkpoints import load_agent
-    from shapebody.design import DesignSpace
-    from shapebody.evaluation import evaluate
-    from shapebody.robots import load_robot
+    from shapebody.agent.store import load_agent
+    from shapebody.design.space import DesignSpace
+    from shapebody.evaluation.evaluate import evaluate
+    from shapebody.robot.robot import load_robot
 
     agent = load_agent(options.agent)
     # Its configuration has the files of robots that are not among the shipped ones.

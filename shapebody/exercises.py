@@ -6,13 +6,7 @@ None means "not tried yet". Answers that are functions may be called with any va
 
 import numpy as np
 
-from shapebody.checks import (
-    require_array,
-    require_integer,
-    require_kind,
-    require_number,
-    single,
-)
+from shapebody.arguments import require_array, require_integer, require_kind, require_number, single
 
 
 def _waiting(answer, task: str) -> bool:
@@ -33,7 +27,7 @@ def _is_function(answer, task: str) -> bool:
 
 
 def _require_space(space) -> None:
-    from shapebody.design import DesignSpace
+    from shapebody.design.space import DesignSpace
 
     require_kind("space", space, DesignSpace, "shapebody.DesignSpace(robot)")
 
@@ -93,7 +87,7 @@ def check_trust_regions(results) -> None:
     if not isinstance(results, dict) or set(results) != {0, 20, 100}:
         print("Not yet. Expected a dictionary with the keys 0, 20 and 100.")
         return
-    from shapebody.search import SearchResult
+    from shapebody.optimizers.search import SearchResult
 
     for trust_region, result in results.items():
         if not isinstance(result, SearchResult):
@@ -132,9 +126,9 @@ def check_largest_step(answer, result) -> None:
     """Exercise: the largest change of one design parameter in one iteration of a search."""
     if _waiting(answer, "the largest change of any parameter between two rows of the trajectory."):
         return
-    from shapebody.search import SearchResult
+    from shapebody.optimizers.search import SearchResult
 
-    require_kind("result", result, SearchResult, "shapebody.search(...)")
+    require_kind("result", result, SearchResult, "shapebody.optimizers(...)")
     answer = _number(answer)
     if answer is None:
         return
@@ -238,8 +232,8 @@ def check_reward(function) -> None:
     """
     if not _is_function(function, "write a function (terms, c) and hand the function over."):
         return
-    from shapebody.locomotion.config import CONTROL_STEP
-    from shapebody.locomotion.rewards import TERMS, combine
+    from shapebody.task.config import CONTROL_STEP
+    from shapebody.task.rewards import TERMS, combine
 
     def compared(terms, c):
         """The reward that the function gives, None if it is no number, and the right one."""
@@ -360,7 +354,7 @@ def check_gae(function) -> None:
         return
     import jax.numpy as jnp
 
-    from shapebody.ppo import advantages
+    from shapebody.training.losses import advantages
 
     generator = np.random.default_rng(0)
     for steps, discount, gae_lambda in (
@@ -516,8 +510,8 @@ def check_per_motor(answer) -> None:
     if not isinstance(answer, str):
         print(f"Not yet. The answer is {_shown(answer)}; it should be the name of one robot.")
         return
-    from shapebody.catalog import robot_table
-    from shapebody.robots import robots
+    from shapebody.reproduction.robot_catalog import robot_table
+    from shapebody.robot.robot import robots
 
     if answer not in robots():
         print(f"Not yet. There is no robot {_shown(answer)}; use a name of sb.robots().")
@@ -537,7 +531,7 @@ def check_per_motor(answer) -> None:
 
 def check_knee_torque(answer, robot) -> None:
     """Exercise: torque in N m at the last hinge of a leg, with the weight shared by all feet."""
-    from shapebody.robots import require_robot
+    from shapebody.robot.robot import require_robot
 
     require_robot(robot)
     if _waiting(answer, "one number in N m."):
@@ -590,7 +584,7 @@ def check_twelve_motors(path) -> None:
     """
     if _waiting(path, "write the file and hand over its path."):
         return
-    from shapebody.validation import validate_robot
+    from shapebody.robot.report import validate_robot
 
     try:
         report = validate_robot(path)
@@ -760,7 +754,7 @@ def check_cem_generation(function) -> None:
     """
     if not _is_function(function, "write the function and hand it over."):
         return
-    from shapebody.search.populations import CEMConfig
+    from shapebody.optimizers.cem import CEMConfig
 
     generator = np.random.default_rng(0)
     for config, spread in (
@@ -845,7 +839,7 @@ def _climb(propose, update) -> float:
     import jax
     import jax.numpy as jnp
 
-    from shapebody.search.loop import Scored
+    from shapebody.optimizers.loop import Scored
 
     Memory = namedtuple("Memory", "design")
     config = SimpleNamespace(particles=16, std=0.12)

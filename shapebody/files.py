@@ -1,4 +1,4 @@
-"""Files that are never half-written, and exact copies of training state. No pickle."""
+"""Where the shipped data lives."""
 
 from __future__ import annotations
 
@@ -23,13 +23,25 @@ import jax.numpy as jnp
 import numpy as np
 import safetensors.numpy
 
-from shapebody.checks import (
-    require_folder,
-    require_kind,
-    require_output,
-    require_path,
-)
+from shapebody.arguments import require_folder, require_kind, require_output, require_path
 from shapebody.stored import read_metadata, read_safetensors, read_text
+
+
+def data_dir() -> Path:
+    """Folder with robots, checkpoints and results.
+
+    `<repository>/data`, or the folder named by the environment variable `SHAPEBODY_DATA`.
+    Raises FileNotFoundError if that folder does not exist.
+    """
+    override = os.environ.get("SHAPEBODY_DATA")
+    shipped = Path(__file__).resolve().parent.parent / "data"
+    folder = require_path("SHAPEBODY_DATA", override) if override else shipped
+    if not folder.is_dir():
+        raise FileNotFoundError(
+            f"data folder {str(folder)!r} does not exist: set SHAPEBODY_DATA to the 'data' folder "
+            "of a shapebody checkout, or install with 'pip install -e .' inside the checkout"
+        )
+    return folder
 
 
 def atomic_write(path: str | Path, data: bytes | str) -> Path:
@@ -150,8 +162,6 @@ def locked(path: Path, patience: float = 60.0):
         lock.unlink(missing_ok=True)
         os.close(handle)
 
-
-# ---------------------------------------------------------------------- files that belong together
 
 PENDING = ".agent.new"
 """Folder with files that are on their way to their places in the folder around it."""

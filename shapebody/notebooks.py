@@ -16,7 +16,7 @@ from pathlib import Path
 
 import nbformat
 
-from shapebody.checks import require_file, require_kind, require_number
+from shapebody.arguments import require_file, require_kind, require_number
 from shapebody.files import atomic_write
 
 LONGEST_CELL = 30

@@ -66,9 +66,9 @@ def start_notebook() -> None:
     os.environ.setdefault("XLA_PYTHON_CLIENT_PREALLOCATE", "false")
     enable_compilation_cache()
 
-    from shapebody import plots, video
+    from shapebody.show import opengl, plots
 
-    interface = video.find_opengl()
+    interface = opengl.find_opengl()
     if sys.platform == "linux" and interface in ("egl", "osmesa"):
         os.environ.setdefault("MUJOCO_GL", interface)
     plots.use_style()

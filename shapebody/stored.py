@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 import safetensors.numpy
 
-from shapebody.checks import shown
+from shapebody.arguments import shown
 
 TEXT_LIMIT = 2**26
 """Bytes of the largest text file that is read, 64 MiB; shipped ones have less than one."""

@@ -50,96 +50,102 @@ from arguments import (
 )
 
 INTERNAL = {
-    "checks": "the checks themselves: every test here is one of them",
-    "assets": "finds and drops meshes, for `reading`",
-    "drawing": "draws models that `video` has looked at",
-    "feet": "reads compiled models, for `robots` and `inference`",
-    "finite": "looks at numbers of files, for `reading` and `robots`",
-    "foot_shapes": "shapes of feet, for `reading` and `inference`",
-    "guard": "looks at files that `robots.find` has found, for `reading`",
-    "inference": "completes compiled models, for `robots`",
-    "locomotion.curriculum": "formulas inside compiled code, called by `locomotion.env`",
-    "locomotion.episode": "one episode inside compiled code, called by `locomotion.env`",
-    "locomotion.observations": "formulas inside compiled code, called by `locomotion.env`",
-    "locomotion.randomization": "formulas inside compiled code, called by `locomotion.env`",
-    "locomotion.readings": "formulas inside compiled code, called by `locomotion.env`",
-    "mjcf": "writes embodiments of `design`, which has looked at the design",
-    "parameters": "tables of a robot, called by `design`",
-    "reading": "reads files that `robots.find` has found",
-    "specs": "edits MuJoCo's specifications, for `inference`",
-    "standing": "simulates robots that `validation` has loaded",
+    "arguments": "the checks themselves: every test here is one of them",
+    "design.export": "writes embodiments of `design.space`, which has looked at the design",
+    "design.parameters": "tables of a robot, called by `design.space`",
+    "robot.assets": "finds and drops meshes, for `robot.importing`",
+    "robot.completion": "completes compiled models, for `robot.robot`",
+    "robot.entries": "reads compiled models, for `robot.robot`",
+    "robot.feet": "completes compiled models, for `robot.completion`",
+    "robot.finite": "looks at numbers of files, for `robot.importing` and `robot.robot`",
+    "robot.foot_shapes": "shapes of feet, for `robot.importing` and `robot.feet`",
+    "robot.geometry": "measures compiled models, for the other modules of `robot`",
+    "robot.guard": "looks at files that `find` has found, for `robot.importing`",
+    "robot.home": "completes compiled models, for `robot.completion`",
+    "robot.importing": "reads files that `find` has found",
+    "robot.leg_ends": "reads compiled models, for `robot.robot` and `robot.completion`",
+    "robot.servos": "completes compiled models, for `robot.completion`",
+    "robot.simulation": "completes compiled models, for `robot.robot`",
+    "robot.spec_edits": "edits MuJoCo's specifications, for `robot.completion`",
+    "robot.standing": "simulates robots that `robot.report` has loaded",
+    "robot.survey": "looks at the text of files, for `robot.guard`",
+    "robot.urdf": "looks at the text of files, for `robot.importing`",
+    "show.software_renderer": "draws models that `show.render` has looked at",
     "stored": "reads files whose paths others have looked at",
-    "survey": "looks at the text of files, for `guard`",
-    "urdf": "looks at the text of files, for `reading`",
+    "task.curriculum": "formulas inside compiled code, called by `task.env`",
+    "task.episode": "one episode inside compiled code, called by `task.env`",
+    "task.observations": "formulas inside compiled code, called by `task.env`",
+    "task.randomization": "formulas inside compiled code, called by `task.env`",
+    "task.sensors": "formulas inside compiled code, called by `task.env`",
 }
 
 RESULT = "a result: the package makes it, no user does"
 FORMULA = "a formula inside compiled code, where values cannot be looked at"
 INSIDE = "called through a network's `apply`, which looks at the inputs"
 METHOD = "called by `search`, which has looked at everything"
-ON_MODEL = "one of the checks of a compiled model, called by `robots.examine`"
+ON_MODEL = "one of the checks of a compiled model, called by `robot.robot.examine`"
 UNCHECKED = {
-    "checkpoints.Agent": "looked at by `check_agent`, which saving and loading call",
-    "descriptions.Descriptions": RESULT,
-    "descriptions.Frames": RESULT,
-    "design.Embodiment": RESULT,
-    "design.quaternion_product": FORMULA,
-    "evaluation.Evaluation": RESULT,
-    "evaluation.Gain": RESULT,
-    "experiments.Budget": "a row of BUDGETS",
-    "locomotion.env.StepRecord": RESULT,
-    "locomotion.env.Trajectory": RESULT,
-    "locomotion.rewards.Moment": RESULT,
-    "locomotion.rewards.Term": "a row of TERMS",
-    "locomotion.rewards.reward_terms": FORMULA,
-    "networks.Core": INSIDE,
-    "networks.Critic.act": INSIDE,
-    "networks.Critic.embed": INSIDE,
-    "networks.Critic.value": INSIDE,
-    "networks.PartEncoder": INSIDE,
-    "networks.PartEncoder.embed": INSIDE,
-    "networks.Policy.act": INSIDE,
-    "networks.Policy.embed": INSIDE,
-    "networks.WeightNormDense": INSIDE,
-    "networks.aggregate": FORMULA,
-    "networks.elu": FORMULA,
-    "networks.entropy": FORMULA,
-    "networks.log_prob": FORMULA,
-    "networks.require_inputs": "a check itself, called by `Agent.act` and `Agent.values`",
-    "physics.Readings": RESULT,
-    "physics.home_sensordata": "called by the engines with the model of `prepare`",
+    "agent.agent.Agent": "looked at by `check_agent`, which saving and loading call",
+    "design.descriptions.Descriptions": RESULT,
+    "design.kinematics.Frames": RESULT,
+    "design.phi.Embodiment": RESULT,
+    "rotations.quaternion_product": FORMULA,
+    "evaluation.evaluate.Evaluation": RESULT,
+    "evaluation.statistics.Gain": RESULT,
+    "reproduction.scale.Budget": "a row of BUDGETS",
+    "task.env.StepRecord": RESULT,
+    "task.env.Trajectory": RESULT,
+    "task.rewards.Moment": RESULT,
+    "task.rewards.Term": "a row of TERMS",
+    "task.rewards.reward_terms": FORMULA,
+    "networks.urma.Core": INSIDE,
+    "networks.critic.Critic.act": INSIDE,
+    "networks.critic.Critic.embed": INSIDE,
+    "networks.critic.Critic.value": INSIDE,
+    "networks.urma.PartEncoder": INSIDE,
+    "networks.urma.PartEncoder.embed": INSIDE,
+    "networks.policy.Policy.act": INSIDE,
+    "networks.policy.Policy.embed": INSIDE,
+    "networks.urma.WeightNormDense": INSIDE,
+    "networks.urma.aggregate": FORMULA,
+    "networks.urma.elu": FORMULA,
+    "networks.policy.entropy": FORMULA,
+    "networks.policy.log_prob": FORMULA,
+    "networks.inputs.require_inputs": "a check itself, called by `Agent.act` and `Agent.values`",
+    "physics.protocol.Readings": RESULT,
+    "physics.protocol.home_sensordata": "called by the engines with the model of `prepare`",
     "physics.mjx.PhysicsState": RESULT,
-    "ppo.Learner": RESULT,
-    "ppo.Trainer.agent": "takes what `state_bank` returned",
-    "ppo.command_changes": FORMULA,
-    "recording.Recording": RESULT,
-    "robots.Robot": RESULT,
-    "robots.examine": "takes a path of `find`",
-    "robots.tilt": "takes the keyframe of a compiled model",
-    "search.loop.Scored": RESULT,
-    "search.loop.Search": RESULT,
-    "search.loop.Steps": "a method of one's own: what it does is up to its functions",
-    "search.loop.last_finite": METHOD,
-    "search.loop.require": "a check itself, called by the methods' configurations",
-    "search.loop.require_integers": "a check itself, called by the methods' configurations",
-    "search.loop.require_positive": "a check itself, called by the methods' configurations",
-    "search.loop.score": METHOD,
-    "search.loop.start_key": METHOD,
-    "search.loop.values_and_gradients": METHOD,
-    "search.methods.Method": "a row of METHODS",
-    "search.methods.SearchResult": RESULT,
-    "search.objective.DesignCritic": "made by `design_critic`",
-    "search.objective.DesignCritic.__call__": "called by `Objective`, inside compiled code",
-    "search.objective.Objective": "made by `Objective.of`",
-    "validation.Report": RESULT,
+    "training.update.Learner": RESULT,
+    "training.trainer.Trainer.agent": "takes what `state_bank` returned",
+    "training.losses.command_changes": FORMULA,
+    "evaluation.recording.Recording": RESULT,
+    "robot.robot.Robot": RESULT,
+    "robot.robot.examine": "takes a path of `find`",
+    "robot.checks.tilt": "takes the keyframe of a compiled model",
+    "optimizers.loop.Scored": RESULT,
+    "optimizers.loop.Search": RESULT,
+    "optimizers.loop.Steps": "a method of one's own: what it does is up to its functions",
+    "optimizers.loop.last_finite": METHOD,
+    "optimizers.loop.require": "a check itself, called by the methods' configurations",
+    "optimizers.loop.require_integers": "a check itself, called by the methods' configurations",
+    "optimizers.loop.require_positive": "a check itself, called by the methods' configurations",
+    "optimizers.loop.score": METHOD,
+    "optimizers.loop.start_key": METHOD,
+    "optimizers.loop.values_and_gradients": METHOD,
+    "optimizers.search.Method": "a row of METHODS",
+    "optimizers.search.SearchResult": RESULT,
+    "optimizers.objective.DesignCritic": "made by `design_critic`",
+    "optimizers.objective.DesignCritic.__call__": "called by `Objective`, inside compiled code",
+    "optimizers.objective.Objective": "made by `Objective.of`",
+    "robot.report.Report": RESULT,
     "notebooks.main": "the command line, see the other test",
 }
 UNCHECKED |= {
-    "checkpoints.read_metadata": "belongs to `stored`",
-    "critics.critic_tasks": "`compare_critics` looks at the arguments",
-    "ppo.Failures": "counts, inside `ppo.Trainer`",
-    "ppo.Failures.add": "counts, inside `ppo.Trainer`",
-    "ppo.Trainer.alone": "takes nothing",
+    "agent.store.read_metadata": "belongs to `stored`",
+    "reproduction.critic_ablation.critic_tasks": "`compare_critics` looks at the arguments",
+    "training.trainer.Failures": "counts, inside `ppo.Trainer`",
+    "training.trainer.Failures.add": "counts, inside `ppo.Trainer`",
+    "training.trainer.Trainer.alone": "takes nothing",
 }
 UNCHECKED |= dict.fromkeys(
     (f"files.{name}" for name in "current locked names_path replace_together settle".split()),
@@ -147,7 +153,7 @@ UNCHECKED |= dict.fromkeys(
 )
 UNCHECKED |= dict.fromkeys(
     (
-        f"robots.check_{name}"
+        f"robot.checks.check_{name}"
         for name in (
             "actuators custom feet home joints loops masses poses ranges spheres tree"
         ).split()
@@ -155,20 +161,20 @@ UNCHECKED |= dict.fromkeys(
     ON_MODEL,
 )
 UNCHECKED |= dict.fromkeys(
-    (f"validation.warn_{x}" for x in "feet friction limits plausibility torque".split()),
+    (f"robot.report.warn_{x}" for x in "feet friction limits plausibility torque".split()),
     "one of the checks of a robot, called by `validate_robot`",
 )
 UNCHECKED |= dict.fromkeys(
     (
-        "search.bayesian.bo search.directions.ars search.evolution.cma_es search.particles.gc_pfo "
-        "search.populations.cem search.populations.de search.populations.pso "
-        "search.sampling.random search.sampling.turbo search.vgds.penalty_only search.vgds.vgds"
+        "optimizers.bayesian.bo optimizers.ars.ars optimizers.cma_es.cma_es optimizers.gc_pfo.gc_pfo "
+        "optimizers.cem.cem optimizers.de.de optimizers.pso.pso "
+        "optimizers.random_search.random optimizers.turbo.turbo optimizers.vgds.penalty_only optimizers.vgds.vgds"
     ).split(),
     METHOD,
 )
 UNCHECKED |= dict.fromkeys(
     (
-        f"locomotion.rewards.{name}"
+        f"task.rewards.{name}"
         for name in (
             "action_rate action_smoothness alive base_height foot_air_time foot_slip "
             "foot_z_velocity imu_acceleration joint_acceleration joint_nominal_deviation "
@@ -252,43 +258,43 @@ TASK_FIELDS |= dict.fromkeys(
 )
 
 FUNCTIONS = {
-    "advice.large_changes": dict(space=SPACE, f=DESIGN, limit=AT_LEAST_0),
-    "advice.objections": dict(
+    "analysis.advice.large_changes": dict(space=SPACE, f=DESIGN, limit=AT_LEAST_0),
+    "analysis.advice.objections": dict(
         walked=thing(lambda world: world.evaluation),
         stood=thing(lambda world: world.evaluation),
         row=integer(0, 1),
         reference=integer(0, 1),
     ),
-    "catalog.gallery": dict(names=NAMES, rows=integer(1, 1000), **SIZE),
-    "catalog.group_scene": dict(names=NAMES, rows=integer(1, 1000)),
-    "catalog.random_bodies": dict(
+    "reproduction.robot_catalog.gallery": dict(names=NAMES, rows=integer(1, 1000), **SIZE),
+    "reproduction.robot_catalog.group_scene": dict(names=NAMES, rows=integer(1, 1000)),
+    "reproduction.robot_catalog.random_bodies": dict(
         robot=ROBOT, designs=integer(1, 10**5), control_steps=integer(1, 10**6), seed=SEED
     ),
-    "catalog.robot_table": dict(names=NAMES),
-    "checkpoints.Agent.act": dict(
+    "reproduction.robot_catalog.robot_table": dict(names=NAMES),
+    "agent.agent.Agent.act": dict(
         descriptions=DESCRIBED, observation=thing(lambda world: world.observation)
     ),
-    "checkpoints.Agent.values": dict(
+    "agent.agent.Agent.values": dict(
         descriptions=DESCRIBED, observation=thing(lambda world: world.observation)
     ),
-    "checkpoints.agent_folder": dict(
+    "agent.store.agent_folder": dict(
         name_or_folder=AGENT_FOLDER.also("Path ..", why="a folder; load_agent looks into it")
     ),
-    "checkpoints.agents": {},
-    "checkpoints.check_agent": dict(agent=AGENT),
-    "checkpoints.chosen_folder": dict(folder=optional(FOLDER).given(None), name=NAME),
-    "checkpoints.load_agent": dict(name_or_folder=AGENT_FOLDER),
-    "checkpoints.load_curve": dict(name_or_folder=AGENT_FOLDER),
-    "checkpoints.provenance": {},
-    "checkpoints.require_agent": dict(agent=AGENT),
-    "checkpoints.save_agent": dict(
+    "agent.store.agents": {},
+    "agent.store.check_agent": dict(agent=AGENT),
+    "agent.store.chosen_folder": dict(folder=optional(FOLDER).given(None), name=NAME),
+    "agent.store.load_agent": dict(name_or_folder=AGENT_FOLDER),
+    "agent.store.load_curve": dict(name_or_folder=AGENT_FOLDER),
+    "provenance.provenance": {},
+    "agent.agent.require_agent": dict(agent=AGENT),
+    "agent.store.save_agent": dict(
         agent=AGENT,
         folder=optional(FOLDER),
         curve=optional(thing(lambda world: [])).also(
             "list", "empty array", why="a curve without rows"
         ),
     ),
-    "critics.compare_critics": dict(
+    "reproduction.critic_ablation.compare_critics": dict(
         critics=CRITICS,
         robot=ROBOT,
         trust_regions=array(1, right=(20.0,), accepts=("list", "empty array")),
@@ -296,30 +302,32 @@ FUNCTIONS = {
         first_start=integer(0, right=0),
         **EVALUATED,
     ),
-    "critics.critic_correlations": dict(critics=CRITICS, robot=ROBOT, records=RECORDS),
-    "critics.critic_gains": dict(records=RECORDS),
-    "descriptions.Sizes": dict(
+    "reproduction.critic_ablation.critic_correlations": dict(
+        critics=CRITICS, robot=ROBOT, records=RECORDS
+    ),
+    "reproduction.critic_ablation.critic_gains": dict(records=RECORDS),
+    "design.descriptions.Sizes": dict(
         joints=integer(1, 10**4), feet=integer(1, 10**4), spheres=integer(0, 10**4)
     ),
-    "descriptions.Sizes.of": dict(robots=ROBOT),
-    "descriptions.describe": dict(
+    "design.descriptions.Sizes.of": dict(robots=ROBOT),
+    "design.descriptions.describe": dict(
         robot=ROBOT, sizes=optional(thing(lambda world: world.agent.sizes))
     ),
-    "descriptions.kinematics": dict(robot=ROBOT),
-    "descriptions.symmetric_feet": dict(robot=ROBOT),
-    "design.DesignSpace": dict(
+    "design.kinematics.kinematics": dict(robot=ROBOT),
+    "design.descriptions.symmetric_feet": dict(robot=ROBOT),
+    "design.space.DesignSpace": dict(
         robot=ROBOT, axes_seed=SEED, published_axes_of=optional(DESIGN).given(None)
     ),
-    "design.DesignSpace.__call__": dict(f=DESIGN),
-    "design.DesignSpace.frozen": dict(names=FROZEN),
-    "design.DesignSpace.start": dict(
+    "design.space.DesignSpace.__call__": dict(f=DESIGN),
+    "design.space.DesignSpace.frozen": dict(names=FROZEN),
+    "design.space.DesignSpace.start": dict(
         seed=integer(0, 2**63, 0).also("2**40", why="a start design has a number, not a seed")
     ),
-    "design.DesignSpace.to_mjcf": dict(f=DESIGN),
-    "design.DesignSpace.to_model": dict(f=DESIGN),
-    "design.DesignSpace.validate": dict(f=DESIGN),
-    "design.published_axes": dict(robot=ROBOT, f=DESIGN),
-    "design.published_axes_seed": dict(
+    "design.space.DesignSpace.to_mjcf": dict(f=DESIGN),
+    "design.space.DesignSpace.to_model": dict(f=DESIGN),
+    "design.space.DesignSpace.validate": dict(f=DESIGN),
+    "design.phi.published_axes": dict(robot=ROBOT, f=DESIGN),
+    "design.phi.published_axes_seed": dict(
         f=DESIGN.also(
             "list",
             "array",
@@ -332,28 +340,28 @@ FUNCTIONS = {
             why="any numbers have a sum",
         )
     ),
-    "design.rotation_axes": dict(
+    "design.phi.rotation_axes": dict(
         generator=thing(lambda world: np.random.default_rng(0)),
         joint_axes=array(2, 3, right=np.eye(3)),
         num_bodies=integer(1, 10**6),
     ),
-    "evaluation.Evaluation.interval": dict(confidence=CONFIDENCE, seed=SEED),
-    "evaluation.Evaluation.summary": {},
-    "evaluation.EvaluationConfig": dict(
+    "evaluation.evaluate.Evaluation.interval": dict(confidence=CONFIDENCE, seed=SEED),
+    "evaluation.evaluate.Evaluation.summary": {},
+    "evaluation.evaluate.EvaluationConfig": dict(
         episodes=integer(1, 10**6),
         coefficient=PROBABILITY,
         task=TASK,
         num_envs=integer(1, 10**6),
         recompute_constants=FLAG,
     ),
-    "evaluation.bootstrap_interval": dict(
+    "evaluation.statistics.bootstrap_interval": dict(
         values=array(3, accepts=("array", "JAX array")),
         baseline=optional(array(3)),
         confidence=CONFIDENCE,
         resamples=integer(1, 10**6),
         seed=SEED,
     ),
-    "evaluation.evaluate": dict(
+    "evaluation.evaluate.evaluate": dict(
         agent=AGENT,
         robot=ROBOT,
         designs=DESIGN,
@@ -363,7 +371,7 @@ FUNCTIONS = {
         config=optional(config("evaluation", "EvaluationConfig")),
         progress=FLAG,
     ),
-    "evaluation.paired_gain": dict(
+    "evaluation.statistics.paired_gain": dict(
         after=array(3),
         before=array(3),
         confidence=CONFIDENCE,
@@ -396,16 +404,16 @@ FUNCTIONS = {
     ),
     "exercises.check_trust_regions": dict(results=ANSWER),
     "exercises.check_twelve_motors": dict(path=ANSWER),
-    "experiments.agent_name": dict(robot=NAME),
-    "experiments.before_after": dict(
+    "reproduction.scale.agent_name": dict(robot=NAME),
+    "reproduction.pictures.before_after": dict(
         agent=AGENT,
         robot=ROBOT,
         path=OUTPUT,
         start=integer(0, 2**63, 0),
         trust_region=TRUST_REGION,
     ),
-    "experiments.budget": {},
-    "experiments.derived_constants": dict(
+    "reproduction.scale.budget": {},
+    "reproduction.derived_constants.derived_constants": dict(
         agent=AGENT,
         robot=ROBOT,
         starts=integer(0, 10**5),
@@ -413,15 +421,17 @@ FUNCTIONS = {
         seed=SEED,
         horizon=integer(1, 10**400),
     ),
-    "experiments.provenance": dict(agent=optional(AGENT), seconds=SECONDS),
-    "experiments.rank_correlation": dict(
+    "reproduction.results.result_provenance": dict(agent=optional(AGENT), seconds=SECONDS),
+    "evaluation.statistics.rank_correlation": dict(
         x=array(4, right=[1.0, 2.0, 3.0]),
         y=array(4, right=[1.0, 2.0, 3.0]),
         resamples=integer(1, 10**6),
         seed=SEED,
     ),
-    "experiments.result": dict(name=NAME, compute=FUNCTION, agent=optional(AGENT), recompute=FLAG),
-    "experiments.result_in_parts": dict(
+    "reproduction.results.result": dict(
+        name=NAME, compute=FUNCTION, agent=optional(AGENT), recompute=FLAG
+    ),
+    "reproduction.results.result_in_parts": dict(
         name=NAME,
         parts=thing(lambda world: {"a": len}),
         agent=optional(AGENT),
@@ -429,39 +439,39 @@ FUNCTIONS = {
         progress=FLAG,
         settings=optional(JSON).also("dictionary", "wrong dictionary", why="settings by part"),
     ),
-    "experiments.result_path": dict(name=NAME),
-    "experiments.scale": {},
-    "experiments.scales_table": {},
-    "experiments.stored_config": dict(name=NAME, agent=optional(AGENT)),
-    "experiments.stored_parts": dict(
+    "reproduction.results.result_path": dict(name=NAME),
+    "reproduction.scale.scale": {},
+    "reproduction.scale.scales_table": {},
+    "reproduction.results.stored_config": dict(name=NAME, agent=optional(AGENT)),
+    "reproduction.results.stored_parts": dict(
         name=NAME,
         agent=optional(AGENT),
         settings=optional(JSON).also("dictionary", "wrong dictionary", why="settings by part"),
     ),
-    "experiments.stored_result": dict(path=thing(lambda world: world.curve)),
-    "experiments.study_setting": {},
-    "experiments.trained_robots": dict(
+    "reproduction.results.stored_result": dict(path=thing(lambda world: world.curve)),
+    "reproduction.scale.study_setting": {},
+    "reproduction.scale.trained_robots": dict(
         robots=thing(lambda world: []).also(
             "list", "list of text", "empty array", "array of text", runs=True, why="robots by name"
         )
     ),
-    "experiments.verdict": dict(low=number(right=-1e301), high=number(right=1e301)),
-    "explorer.LiveScene": dict(space=SPACE),
-    "explorer.LiveScene.show": dict(f=optional(DESIGN)),
-    "explorer.Scene": dict(
+    "evaluation.statistics.verdict": dict(low=number(right=-1e301), high=number(right=1e301)),
+    "show.scene.LiveScene": dict(space=SPACE),
+    "show.scene.LiveScene.show": dict(f=optional(DESIGN)),
+    "show.scene.Scene": dict(
         commands=thing(lambda world: []).also("list", "empty array", why="an empty scene"),
         height=HEIGHT,
     ),
-    "explorer.Scene.save": dict(path=OUTPUT),
-    "explorer.Scene.static_html": {},
-    "explorer.animate_designs": dict(
+    "show.scene.Scene.save": dict(path=OUTPUT),
+    "show.scene.Scene.static_html": {},
+    "show.scene.animate_designs": dict(
         space=SPACE,
         trajectory=thing(lambda world: np.zeros((2, world.space.dim))),
         seconds=number(0.01, 3600),
         frames=integer(2, 10**4),
         height=HEIGHT,
     ),
-    "explorer.show_design": dict(
+    "show.scene.show_design": dict(
         robot_or_space=SPACE,
         f=optional(DESIGN),
         qpos=optional(QPOS),
@@ -493,7 +503,7 @@ FUNCTIONS = {
             why="any numbers and arrays",
         ),
     ),
-    "imitation.begin_run": dict(
+    "training.imitation.begin_run": dict(
         config=thing(lambda world: world.train_config),
         teacher=AGENT,
         steps=STEPS,
@@ -501,10 +511,10 @@ FUNCTIONS = {
         engine=ENGINE,
         progress=FLAG,
     ),
-    "locomotion.config.TaskConfig": TASK_FIELDS,
-    "locomotion.config.TaskConfig.ancestors": {},
-    "locomotion.config.TaskConfig.evaluation": {},
-    "locomotion.env.Locomotion": dict(
+    "task.config.TaskConfig": TASK_FIELDS,
+    "task.config.TaskConfig.ancestors": {},
+    "task.config.TaskConfig.evaluation": {},
+    "task.env.Locomotion": dict(
         robots=ROBOT,
         num_envs=integer(1, 2**20),
         engine=ENGINE,
@@ -514,18 +524,18 @@ FUNCTIONS = {
         threads=integer(0, 4096),
         physics_options=optional(thing(lambda world: {})).also("dictionary", why="no options"),
     ),
-    "locomotion.env.Locomotion.descriptions": dict(
+    "task.env.Locomotion.descriptions": dict(
         robot=integer(0, 0, 0), designs=thing(lambda world: world.space.reference[None])
     ),
-    "locomotion.env.Locomotion.physics_arrays": {},
-    "locomotion.env.Locomotion.reset": dict(
+    "task.env.Locomotion.physics_arrays": {},
+    "task.env.Locomotion.reset": dict(
         key=optional(KEY),
         designs=optional(DESIGN),
         coefficient=PROBABILITY,
         spread=FLAG,
         keys=optional(thing(lambda world: np.zeros((2, 2), np.uint32))),
     ),
-    "locomotion.env.Locomotion.restart": dict(
+    "task.env.Locomotion.restart": dict(
         state=STATE,
         rows=array(1, right=[0]).also("list", "empty array", why="no rows"),
         keys=thing(lambda world: np.zeros((1, 2), np.uint32)),
@@ -533,17 +543,17 @@ FUNCTIONS = {
         coefficient=PROBABILITY,
         streak=integer(-(2**31), 2**31 - 1, 0),
     ),
-    "locomotion.env.Locomotion.restore": dict(state=STATE, arrays=thing(lambda world: [{}])),
-    "locomotion.env.Locomotion.rollout": dict(**CALLED, length=integer(1, 10**6)),
-    "locomotion.env.Locomotion.step": dict(
+    "task.env.Locomotion.restore": dict(state=STATE, arrays=thing(lambda world: [{}])),
+    "task.env.Locomotion.rollout": dict(**CALLED, length=integer(1, 10**6)),
+    "task.env.Locomotion.step": dict(
         **CALLED, running=optional(thing(lambda world: np.ones(2, bool)))
     ),
-    "locomotion.env.Locomotion.with_task": dict(config=TASK),
-    "locomotion.rewards.combine": dict(
+    "task.env.Locomotion.with_task": dict(config=TASK),
+    "task.rewards.combine": dict(
         terms=array(23), coefficient=PROBABILITY.also(*WRONG, why=FORMULA)
     ),
-    "networks.Critic": dict(config=config("networks", "CriticConfig")),
-    "networks.CriticConfig": dict(
+    "networks.critic.Critic": dict(config=config("networks", "CriticConfig")),
+    "networks.config.CriticConfig": dict(
         kind=choice("original"),
         heads=WIDTH_1,
         joint_key_widths=WIDTHS,
@@ -553,11 +563,11 @@ FUNCTIONS = {
         head_widths=WIDTHS,
         **TEMPERATURES,
     ),
-    "networks.CriticConfig.original": {},
-    "networks.CriticConfig.reduced": {},
-    "networks.CriticConfig.sharp": {},
-    "networks.Policy": dict(config=config("networks", "PolicyConfig")),
-    "networks.PolicyConfig": dict(
+    "networks.config.CriticConfig.original": {},
+    "networks.config.CriticConfig.reduced": {},
+    "networks.config.CriticConfig.sharp": {},
+    "networks.policy.Policy": dict(config=config("networks", "PolicyConfig")),
+    "networks.config.PolicyConfig": dict(
         key_widths=WIDTHS,
         value_latent=WIDTH_1,
         core_widths=WIDTHS,
@@ -567,8 +577,8 @@ FUNCTIONS = {
         std_limits=array(2, right=(0.5, 1.9)),
         **TEMPERATURES,
     ),
-    "networks.PolicyConfig.reduced": {},
-    "networks.count_parameters": dict(
+    "networks.config.PolicyConfig.reduced": {},
+    "networks.inputs.count_parameters": dict(
         params=thing(lambda world: world.agent.policy["params"]).also(
             "NumPy NaN",
             "array of text",
@@ -580,19 +590,21 @@ FUNCTIONS = {
             why="any arrays are counted",
         )
     ),
-    "networks.initialize": dict(
+    "networks.inputs.initialize": dict(
         network=thing(lambda world: world.agent.policy_module),
         key=KEY,
         constants=optional(thing(lambda world: None)),
     ),
-    "networks.standardization": dict(descriptions=DESCRIBED, floor=POSITIVE, constant=AT_LEAST_0),
+    "networks.inputs.standardization": dict(
+        descriptions=DESCRIBED, floor=POSITIVE, constant=AT_LEAST_0
+    ),
     "notebooks.execute": dict(path=thing(lambda world: world.notebook), timeout=optional(POSITIVE)),
     "notebooks.normalise": dict(notebook=thing(lambda world: None)),
     "notebooks.parser": {},
     "notebooks.problems": dict(path=thing(lambda world: world.notebook)),
-    "paper.trust_region_gain": dict(robot=TEXT, trust_region=AT_LEAST_0),
-    "paths.data_dir": {},
-    "physics.prepare": dict(
+    "reproduction.paper.trust_region_gain": dict(robot=TEXT, trust_region=AT_LEAST_0),
+    "files.data_dir": {},
+    "physics.protocol.prepare": dict(
         robot=ROBOT,
         solver_iterations=optional(integer(1, 10**4)),
         line_search=optional(integer(1, 10**4)),
@@ -647,35 +659,35 @@ FUNCTIONS = {
         qvel=optional(thing(lambda world: np.zeros((2, world.robot.model.nv)))),
         running=optional(thing(lambda world: np.zeros(2, bool))),
     ),
-    "plots.Table": dict(
+    "show.tables.Table": dict(
         header=thing(lambda world: ("a",)),
         rows=thing(lambda world: ()).also("list", "empty array", why="no rows"),
         caption=TEXT.also("long", "long path", why="a caption may be long"),
     ),
-    "plots.Table.markdown": {},
-    "plots.agents_table": dict(
+    "show.tables.Table.markdown": {},
+    "show.tables.agents_table": dict(
         agents=thing(lambda world: []).also("list", "empty array", why="an empty table")
     ),
-    "plots.intervals": dict(
+    "show.plots.intervals": dict(
         labels=thing(lambda world: ["a"]).also("list of text", "array of text", why="labels"),
         values=thing(lambda world: [(0.0, -1.0, 1.0)]).also("list of None", why="an empty row"),
         colours=thing(lambda world: []).also("list", "empty array", why="the default colours"),
         ax=optional(AXES),
     ),
-    "plots.learning_curve": dict(
+    "show.plots.learning_curve": dict(
         path=thing(lambda world: world.curve),
         y=choice("coefficient"),
         x=choice("steps"),
         ax=optional(AXES).given(lambda world: world.axes),
         smooth=integer(1, 10**6),
     ),
-    "plots.paper_table": dict(
+    "show.tables.paper_table": dict(
         rows=thing(lambda world: [("a", 1, 2)]).also("list", "empty array", why="an empty table"),
         digits=integer(0, 17),
         caption=TEXT.also("long", "long path", why="a caption may be long"),
         note=TEXT,
     ),
-    "plots.table": dict(
+    "show.tables.table": dict(
         rows=thing(lambda world: [("a",)]).also("list", "empty array", why="an empty table"),
         header=thing(lambda world: ["a"]).also(
             "list of None",
@@ -691,8 +703,8 @@ FUNCTIONS = {
         digits=integer(0, 17),
         caption=TEXT.also("long", "long path", why="a caption may be long"),
     ),
-    "plots.use_style": {},
-    "ppo.TrainConfig": dict(
+    "show.plots.use_style": {},
+    "training.config.TrainConfig": dict(
         name=NAME,
         robots=thing(lambda world: "robot").also(
             "a/b", "list of text", "array of text", why="names or paths, read later"
@@ -721,30 +733,30 @@ FUNCTIONS = {
         mean_actions=FLAG,
         state_bank=integer(1, 2**24),
     ),
-    "ppo.TrainConfig.at_scale": dict(scale=choice("smoke"), robot=ROBOT_NAME),
-    "ppo.TrainConfig.full": dict(robot=ROBOT_NAME),
-    "ppo.TrainConfig.reduced": dict(robot=ROBOT_NAME),
-    "ppo.TrainConfig.smoke": dict(robot=ROBOT_NAME),
-    "ppo.Trainer": dict(
+    "training.config.TrainConfig.at_scale": dict(scale=choice("smoke"), robot=ROBOT_NAME),
+    "training.config.TrainConfig.full": dict(robot=ROBOT_NAME),
+    "training.config.TrainConfig.reduced": dict(robot=ROBOT_NAME),
+    "training.config.TrainConfig.smoke": dict(robot=ROBOT_NAME),
+    "training.trainer.Trainer": dict(
         config=thing(lambda world: world.train_config),
         folder=optional(FOLDER),
         engine=ENGINE,
         policy=optional(thing(lambda world: world.agent.policy)),
     ),
-    "ppo.Trainer.last_iteration": dict(
+    "training.trainer.Trainer.last_iteration": dict(
         max_steps=optional(integer(0, 10**15)).also("2**40", why="more than all steps", runs=True)
     ),
-    "ppo.Trainer.run": dict(
+    "training.trainer.Trainer.run": dict(
         max_steps=optional(integer(0, 10**15)),
         max_seconds=SECONDS,
         progress=FLAG,
         curve_interval=optional(COUNT),
     ),
-    "ppo.Trainer.save": {},
-    "ppo.Trainer.save_agent": dict(folder=optional(FOLDER)),
-    "ppo.Trainer.start": {},
-    "ppo.Trainer.state_bank": dict(rollouts=integer(1, 10**5)),
-    "ppo.advantages": dict(
+    "training.trainer.Trainer.save": {},
+    "training.trainer.Trainer.save_agent": dict(folder=optional(FOLDER)),
+    "training.trainer.Trainer.start": {},
+    "training.trainer.Trainer.state_bank": dict(rollouts=integer(1, 10**5)),
+    "training.losses.advantages": dict(
         reward=array(2, 3),
         value=array(2, 3),
         last_value=array(2),
@@ -753,7 +765,7 @@ FUNCTIONS = {
         discount=PROBABILITY.also(*WRONG, why=FORMULA),
         gae_lambda=PROBABILITY.also(*WRONG, why=FORMULA),
     ),
-    "ppo.anneal": RESUMED
+    "training.train.anneal": RESUMED
     | dict(
         name=NAME,
         steps=STEPS,
@@ -761,35 +773,35 @@ FUNCTIONS = {
         replace=FLAG,
         folder=optional(FOLDER).given(None),
     ),
-    "ppo.as_continued": dict(
+    "training.run_state.as_continued": dict(
         config=thing(lambda world: world.train_config), folder=optional(FOLDER)
     ),
-    "ppo.make_policy_function": dict(
+    "training.update.make_policy_function": dict(
         policy=thing(lambda world: world.agent.policy_module), mean_actions=FLAG
     ),
-    "ppo.make_update": dict(
+    "training.update.make_update": dict(
         config=thing(lambda world: world.train_config),
         policy=thing(lambda world: world.agent.policy_module),
         critic=thing(lambda world: world.agent.critic_module),
     ),
-    "ppo.train": dict(
+    "training.train.train": dict(
         config=thing(lambda world: world.train_config),
         max_steps=optional(STEPS),
         state_only=FLAG,
         replace=FLAG,
         **RESUMED,
     ),
-    "ppo.train_critic": dict(
+    "training.policy_evaluation.train_critic": dict(
         agent=AGENT,
         critic=config("networks", "CriticConfig"),
         steps=optional(STEPS),
         task_of=choice("training"),
         **RESUMED,
     ),
-    "published.load_published_policy": dict(
+    "networks.published.load_published_policy": dict(
         folder=thing(lambda world: world.folder), name=optional(NAME)
     ),
-    "recording.record_episode": dict(
+    "evaluation.recording.record_episode": dict(
         agent=AGENT,
         robot=ROBOT,
         design=optional(DESIGN),
@@ -799,34 +811,34 @@ FUNCTIONS = {
         coefficient=PROBABILITY,
         task=optional(TASK),
     ),
-    "robots.find": dict(name_or_path=ROBOT_FILE),
-    "robots.load_robot": dict(name_or_path=ROBOT_FILE),
-    "robots.require_robot": dict(robot=ROBOT),
-    "robots.robots": {},
+    "robot.robot.find": dict(name_or_path=ROBOT_FILE),
+    "robot.robot.load_robot": dict(name_or_path=ROBOT_FILE),
+    "robot.robot.require_robot": dict(robot=ROBOT),
+    "robot.robot.robots": {},
     "runtime.cache_folder": {},
     "runtime.enable_compilation_cache": {},
     "runtime.keep_memory": {},
     "runtime.start_notebook": {},
-    "search.bayesian.BOConfig": dict(
+    "optimizers.bayesian.BOConfig": dict(
         initial_points=integer(2, 10**6, 2),
         restarts=CONFIG_COUNT,
         raw_samples=CONFIG_COUNT,
         steps=CONFIG_COUNT,
         **ITERATIONS,
     ),
-    "search.directions.ARSConfig": dict(
+    "optimizers.ars.ARSConfig": dict(
         directions=CONFIG_COUNT,
         perturbation_std=POSITIVE,
         learning_rate=POSITIVE,
         top_fraction=number(1e-300, 1, 0.5),
         **ITERATIONS,
     ),
-    "search.evolution.CMAESConfig": dict(
+    "optimizers.cma_es.CMAESConfig": dict(
         particles=optional(integer(2, 10**6, 4)), **ITERATIONS, **STD
     ),
-    "search.evolution.CMAESConfig.population": dict(dim=COUNT),
-    "search.loop.cores": {},
-    "search.loop.iterate": dict(
+    "optimizers.cma_es.CMAESConfig.population": dict(dim=COUNT),
+    "optimizers.loop.cores": {},
+    "optimizers.loop.iterate": dict(
         objective=thing(lambda world: world.objective).also(*WRONG, why="the caller's own"),
         starts=array(1, 3, accepts=("JAX array",)),
         key=KEY,
@@ -834,7 +846,7 @@ FUNCTIONS = {
         steps=thing(lambda world: world.steps),
         evaluations=integer(0, right=0),
     ),
-    "search.methods.search": dict(
+    "optimizers.search.search": dict(
         method=choice("vgds"),
         agent=AGENT,
         robot=ROBOT,
@@ -846,11 +858,11 @@ FUNCTIONS = {
         states=STATES,
         frozen=FROZEN,
     ),
-    "search.objective.DesignCritic.descriptions": dict(designs=DESIGN),
-    "search.objective.Objective.__call__": dict(designs=DESIGN, states=STATES),
-    "search.objective.Objective.batch": dict(key=KEY),
-    "search.objective.Objective.hold": dict(designs=DESIGN),
-    "search.objective.Objective.of": dict(
+    "optimizers.objective.DesignCritic.descriptions": dict(designs=DESIGN),
+    "optimizers.objective.Objective.__call__": dict(designs=DESIGN, states=STATES),
+    "optimizers.objective.Objective.batch": dict(key=KEY),
+    "optimizers.objective.Objective.hold": dict(designs=DESIGN),
+    "optimizers.objective.Objective.of": dict(
         agent=AGENT,
         robot=ROBOT,
         trust_region=TRUST_REGION,
@@ -859,12 +871,14 @@ FUNCTIONS = {
         batch_size=COUNT,
         frozen=FROZEN,
     ),
-    "search.objective.Objective.penalty": dict(designs=DESIGN),
-    "search.objective.Objective.value": dict(designs=DESIGN, states=STATES),
-    "search.objective.bank": dict(agent=AGENT, robot=ROBOT),
-    "search.objective.design_critic": dict(robot=ROBOT, config=config("networks", "CriticConfig")),
-    "search.objective.trim": dict(states=thing(lambda world: world.agent.states), robot=ROBOT),
-    "search.particles.GCPFOConfig": dict(
+    "optimizers.objective.Objective.penalty": dict(designs=DESIGN),
+    "optimizers.objective.Objective.value": dict(designs=DESIGN, states=STATES),
+    "optimizers.state_bank.bank": dict(agent=AGENT, robot=ROBOT),
+    "optimizers.objective.design_critic": dict(
+        robot=ROBOT, config=config("networks", "CriticConfig")
+    ),
+    "optimizers.state_bank.trim": dict(states=thing(lambda world: world.agent.states), robot=ROBOT),
+    "optimizers.gc_pfo.GCPFOConfig": dict(
         regions=CONFIG_COUNT,
         particles=integer(2, 10**6, 2),
         step_size=POSITIVE,
@@ -872,21 +886,21 @@ FUNCTIONS = {
         epsilon=POSITIVE,
         **ITERATIONS,
     ),
-    "search.populations.CEMConfig": dict(
+    "optimizers.cem.CEMConfig": dict(
         particles=CONFIG_COUNT,
         elite_fraction=number(1e-300, 1, 0.5),
         minimum_std=POSITIVE,
         **ITERATIONS,
         **STD,
     ),
-    "search.populations.DEConfig": dict(
+    "optimizers.de.DEConfig": dict(
         particles=integer(4, 10**6, 4),
         weight=number(0, 2),
         crossover=PROBABILITY,
         initial_std=optional(POSITIVE),
         **ITERATIONS,
     ),
-    "search.populations.PSOConfig": dict(
+    "optimizers.pso.PSOConfig": dict(
         particles=CONFIG_COUNT,
         inertia=AT_LEAST_0,
         cognitive=AT_LEAST_0,
@@ -894,8 +908,8 @@ FUNCTIONS = {
         initial_std=optional(POSITIVE),
         **ITERATIONS,
     ),
-    "search.sampling.RandomConfig": dict(candidates=CONFIG_COUNT, **ITERATIONS),
-    "search.sampling.TuRBOConfig": dict(
+    "optimizers.random_search.RandomConfig": dict(candidates=CONFIG_COUNT, **ITERATIONS),
+    "optimizers.turbo.TuRBOConfig": dict(
         candidates=CONFIG_COUNT,
         # Between the smallest and the largest one.
         radius=number(0.005, 0.5, 0.1),
@@ -905,54 +919,54 @@ FUNCTIONS = {
         expand=number(1, right=1.3),
         **ITERATIONS,
     ),
-    "search.vgds.VGDSConfig": dict(learning_rate=POSITIVE, max_update=POSITIVE, **ITERATIONS),
-    "studies.Run": dict(
+    "optimizers.vgds.VGDSConfig": dict(learning_rate=POSITIVE, max_update=POSITIVE, **ITERATIONS),
+    "reproduction.design_study.Run": dict(
         method=choice("vgds").also(*WRONG, why="looked at by the studies"),
         trust_region=choice(1.0).also(*WRONG, why="looked at by the studies"),
         origin=choice("start").also(*WRONG, why="looked at by the studies"),
     ),
-    "studies.available": STUDY,
-    "studies.design_study": STUDY | dict(progress=FLAG),
-    "studies.gain": dict(
+    "reproduction.design_study.available": STUDY,
+    "reproduction.design_study.design_study": STUDY | dict(progress=FLAG),
+    "reproduction.gains.gain": dict(
         rows=RECORDS,
         method=choice("none"),
         over=choice("start"),
         trust_region=optional(choice(1.0)),
     ),
-    "studies.gains": dict(records=RECORDS, quantity=choice("return")),
-    "studies.installed": dict(runs=RUNS),
-    "studies.published_policy": dict(
+    "reproduction.gains.gains": dict(records=RECORDS, quantity=choice("return")),
+    "reproduction.design_study.installed": dict(runs=RUNS),
+    "reproduction.value_studies.published_policy": dict(
         robot=ROBOT,
         agent=AGENT,
         folder=optional(thing(lambda world: world.folder)),
         starts=integer(1, 10**6),
         episodes=integer(1, 10**6),
     ),
-    "studies.size_share": dict(
+    "reproduction.value_studies.size_share": dict(
         agent=AGENT,
         robot=ROBOT,
         starts=integer(1, 10**6),
         iterations=optional(integer(1, 10**6)),
         **EVALUATED,
     ),
-    "studies.value_against_return": dict(
+    "reproduction.value_studies.value_against_return": dict(
         agent=AGENT, robot=ROBOT, designs=integer(1, 10**6), progress=FLAG, **EVALUATED
     ),
-    "validation.Report.write": dict(path=OUTPUT),
-    "validation.validate_robot": dict(
+    "robot.report.Report.write": dict(path=OUTPUT),
+    "robot.report.validate_robot": dict(
         name_or_path=ROBOT_FILE.also(
             "dots", "a/b", "Path ..", why="the report says that there is no file", runs=True
         )
     ),
-    "video.Renderer": dict(model=MODEL, spheres=FLAG, smooth=FLAG, opengl=FLAG, **SIZE),
-    "video.Renderer.centre": {},
-    "video.Renderer.close": {},
-    "video.Renderer.distance": dict(lookat=array(3), **CAMERA),
-    "video.Renderer.picture": dict(
+    "show.render.Renderer": dict(model=MODEL, spheres=FLAG, smooth=FLAG, opengl=FLAG, **SIZE),
+    "show.render.Renderer.centre": {},
+    "show.render.Renderer.close": {},
+    "show.render.Renderer.distance": dict(lookat=array(3), **CAMERA),
+    "show.render.Renderer.picture": dict(
         qpos=QPOS, lookat=optional(array(3)), distance=DISTANCE, **CAMERA
     ),
-    "video.Renderer.place": dict(qpos=QPOS),
-    "video.body_grid": dict(
+    "show.render.Renderer.place": dict(qpos=QPOS),
+    "show.video.body_grid": dict(
         bodies=thing(lambda world: [world.robot]),
         qpos=optional(thing(lambda world: [world.robot.home])),
         labels=optional(thing(lambda world: ["a"])).also(
@@ -962,12 +976,12 @@ FUNCTIONS = {
         **SIZE,
         **CAMERA,
     ),
-    "video.encode_video": PLAYED,
-    "video.ffmpeg": {},
-    "video.film_strip": dict(frames=FRAMES, count=integer(1, 1000)),
-    "video.find_opengl": {},
-    "video.render_frame": dict(body=ROBOT, qpos=optional(QPOS), spheres=FLAG, **SIZE),
-    "video.render_rollout": dict(
+    "show.video.encode_video": PLAYED,
+    "show.video.ffmpeg": {},
+    "show.video.film_strip": dict(frames=FRAMES, count=integer(1, 1000)),
+    "show.opengl.find_opengl": {},
+    "show.render.render_frame": dict(body=ROBOT, qpos=optional(QPOS), spheres=FLAG, **SIZE),
+    "show.video.render_rollout": dict(
         body=ROBOT,
         qpos=thing(lambda world: world.robot.home[None]),
         fps=FPS,
@@ -977,21 +991,21 @@ FUNCTIONS = {
         **SIZE,
         **CAMERA,
     ),
-    "video.require_size": SIZE,
-    "video.save_video": dict(path=OUTPUT, **PLAYED),
-    "video.show_image": dict(
+    "show.render.require_size": SIZE,
+    "show.video.save_video": dict(path=OUTPUT, **PLAYED),
+    "show.video.show_image": dict(
         picture=thing(lambda world: np.zeros((32, 32, 3), np.uint8)),
         width=WIDTH,
         colours=optional(integer(2, 256, 8)),
     ),
-    "video.show_video": PLAYED | dict(width=WIDTH),
-    "video.side_by_side": dict(
+    "show.video.show_video": PLAYED | dict(width=WIDTH),
+    "show.video.side_by_side": dict(
         clips=FRAMES,
         labels=optional(thing(lambda world: ["a"])).also(
             "list of text", "array of text", why="one label"
         ),
     ),
-    "video.standing_pose": dict(model=MODEL),
-    "video.video_html": PLAYED | dict(width=WIDTH),
-    "video.with_label": dict(frames=FRAMES, text=TEXT),
+    "show.render.standing_pose": dict(model=MODEL),
+    "show.video.video_html": PLAYED | dict(width=WIDTH),
+    "show.video.with_label": dict(frames=FRAMES, text=TEXT),
 }

@@ -211,28 +211,28 @@ def _(world):
     return tiny_robot(world.folder)
 
 
-@makes("agent", "checkpoints.Agent")
+@makes("agent", "agent.agent.Agent")
 def _(world):
     return tiny_agent(world.robot)
 
 
 @makes("agent_folder")
 def _(world):
-    from shapebody.checkpoints import save_agent
+    from shapebody.agent.store import save_agent
 
     return save_agent(world.agent, world.folder / "agent")
 
 
-@makes("space", "design.DesignSpace")
+@makes("space", "design.space.DesignSpace")
 def _(world):
-    from shapebody.design import DesignSpace
+    from shapebody.design.space import DesignSpace
 
     return DesignSpace(world.robot)
 
 
 @makes("task")
 def _(world):
-    from shapebody.locomotion import TaskConfig
+    from shapebody.task.config import TaskConfig
 
     return TaskConfig()
 
@@ -240,7 +240,7 @@ def _(world):
 @makes("bodies")
 def _(world):
     """Embodiments of two designs, without compiling the map."""
-    from shapebody.design import MODEL_FIELDS, Embodiment
+    from shapebody.design.phi import MODEL_FIELDS, Embodiment
 
     model = world.robot.model
     fields = {name: np.stack([getattr(model, name)] * 2) for name in MODEL_FIELDS}
@@ -252,14 +252,14 @@ def _(world):
 
 @makes("descriptions")
 def _(world):
-    from shapebody import networks
+    from shapebody.networks import inputs
 
     parts = dict(
-        joints=np.zeros((2, networks.JOINT_DESCRIPTION), np.float32),
+        joints=np.zeros((2, inputs.JOINT_DESCRIPTION), np.float32),
         joint_mask=np.ones(2),
-        feet=np.zeros((2, networks.FOOT_DESCRIPTION), np.float32),
+        feet=np.zeros((2, inputs.FOOT_DESCRIPTION), np.float32),
         foot_mask=np.ones(2),
-        static=np.zeros(networks.STATIC, np.float32),
+        static=np.zeros(inputs.STATIC, np.float32),
     )
     return types.SimpleNamespace(**parts)
 
@@ -269,21 +269,21 @@ def _(world):
     return jax.tree.map(lambda x: x[0], world.agent.states)
 
 
-@makes("objective", "search.objective.Objective")
+@makes("objective", "optimizers.objective.Objective")
 def _(world):
-    from shapebody.search import Objective
+    from shapebody.optimizers.objective import Objective
 
     return Objective.of(world.agent, world.robot)
 
 
-@makes("designs_critic", "search.objective.DesignCritic")
+@makes("designs_critic", "optimizers.objective.DesignCritic")
 def _(world):
     return world.objective.values
 
 
-@makes("env", "locomotion.env.Locomotion")
+@makes("env", "task.env.Locomotion")
 def _(world):
-    from shapebody.locomotion import Locomotion
+    from shapebody.task.env import Locomotion
 
     return Locomotion(world.robot, 2, "native", threads=1)
 
@@ -291,7 +291,7 @@ def _(world):
 @makes("state")
 def _(world):
     """A state that nothing looks into: wrong arguments are refused before."""
-    from shapebody.locomotion import Episode
+    from shapebody.task.episode import Episode
 
     return object.__new__(Episode)
 
@@ -315,26 +315,26 @@ def _(world):
     return object.__new__(PhysicsState)
 
 
-@makes("renderer", "video.Renderer")
+@makes("renderer", "show.render.Renderer")
 def _(world):
-    from shapebody.video import Renderer
+    from shapebody.show.render import Renderer
 
     return Renderer(world.robot.model, 32, 32, opengl=False)
 
 
-@makes("live", "explorer.LiveScene")
+@makes("live", "show.scene.LiveScene")
 def _(world):
     """Without the viewer, which starts a server."""
-    from shapebody.explorer import LiveScene
+    from shapebody.show.scene import LiveScene
 
     live = object.__new__(LiveScene)
     live.space, live._parts = world.space, None
     return live
 
 
-@makes("scene", "explorer.Scene")
+@makes("scene", "show.scene.Scene")
 def _(world):
-    from shapebody.explorer import Scene
+    from shapebody.show.scene import Scene
 
     return Scene([])
 
@@ -346,9 +346,9 @@ def _(world):
     return matplotlib.figure.Figure().subplots()
 
 
-@makes("evaluation", "evaluation.Evaluation")
+@makes("evaluation", "evaluation.evaluate.Evaluation")
 def _(world):
-    from shapebody.evaluation import Evaluation
+    from shapebody.evaluation.evaluate import Evaluation
 
     rows = np.zeros((2, 3), np.float32)
     names = ("robot", "engine", "seed", "coefficient", "task", "recompute_constants")
@@ -357,15 +357,15 @@ def _(world):
 
 @makes("train_config")
 def _(world):
-    from shapebody.ppo import TrainConfig
+    from shapebody.training.config import TrainConfig
 
     return TrainConfig.smoke(str(world.robot.path), name="tiny")
 
 
-@makes("trainer", "ppo.Trainer")
+@makes("trainer", "training.trainer.Trainer")
 def _(world):
     """Without networks and environments."""
-    from shapebody.ppo import Trainer
+    from shapebody.training.trainer import Trainer
 
     trainer = object.__new__(Trainer)
     trainer.config, trainer.folder = world.train_config, world.folder
@@ -374,7 +374,7 @@ def _(world):
 
 @makes("runs")
 def _(world):
-    from shapebody.studies import Run
+    from shapebody.reproduction.design_study import Run
 
     return (Run("vgds", 20.0),)
 
@@ -387,16 +387,16 @@ def _(world):
     return [row, {**row, "origin": "reference"}]
 
 
-@makes("report", "validation.Report")
+@makes("report", "robot.report.Report")
 def _(world):
-    from shapebody.validation import Report
+    from shapebody.robot.report import Report
 
     return Report(world.robot.path, world.robot, (), (), ())
 
 
 @makes("search_result")
 def _(world):
-    from shapebody.search import SearchResult
+    from shapebody.optimizers.search import SearchResult
 
     path = np.zeros((3, world.space.dim), np.float32)
     settings = dict(max_update=0.1, learning_rate=0.05, trust_region=0.0)
@@ -419,16 +419,16 @@ def _(world):
     return path
 
 
-@makes("cma_es", "search.evolution.CMAESConfig")
+@makes("cma_es", "optimizers.cma_es.CMAESConfig")
 def _(world):
-    from shapebody.search.evolution import CMAESConfig
+    from shapebody.optimizers.cma_es import CMAESConfig
 
     return CMAESConfig()
 
 
 @makes("steps")
 def _(world):
-    from shapebody.search.loop import Steps
+    from shapebody.optimizers.loop import Steps
 
     return Steps(len, len, len)
 

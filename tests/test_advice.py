@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 from tiny import tiny_agent, tiny_robot
 
-from shapebody.advice import LARGE_CHANGE, large_changes, objections
-from shapebody.design import DesignSpace
-from shapebody.evaluation import EvaluationConfig, evaluate
-from shapebody.locomotion import TaskConfig
-from shapebody.robots import load_robot
+from shapebody.analysis.advice import LARGE_CHANGE, large_changes, objections
+from shapebody.design.space import DesignSpace
+from shapebody.evaluation.evaluate import EvaluationConfig, evaluate
+from shapebody.robot.robot import load_robot
+from shapebody.task.config import TaskConfig
 
 
 @pytest.fixture(scope="module")

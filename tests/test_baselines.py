@@ -12,17 +12,21 @@ import numpy as np
 import pytest
 from tiny import quick_compilation, tiny_agent, tiny_robot
 
-from shapebody.checkpoints import load_agent
-from shapebody.design import DesignSpace
-from shapebody.robots import load_robot
-from shapebody.search import METHODS, Objective, search
-from shapebody.search.directions import ARSConfig, ars
-from shapebody.search.evolution import CMAESConfig, cma_es
-from shapebody.search.loop import start_key
-from shapebody.search.particles import GCPFOConfig, _move
-from shapebody.search.populations import CEMConfig, DEConfig, PSOConfig, cem, de, pso
-from shapebody.search.sampling import RandomConfig, TuRBOConfig, random, turbo
-from shapebody.search.vgds import VGDSConfig
+from shapebody.agent.store import load_agent
+from shapebody.design.space import DesignSpace
+from shapebody.optimizers.ars import ARSConfig, ars
+from shapebody.optimizers.cem import CEMConfig, cem
+from shapebody.optimizers.cma_es import CMAESConfig, cma_es
+from shapebody.optimizers.de import DEConfig, de
+from shapebody.optimizers.gc_pfo import GCPFOConfig, _move
+from shapebody.optimizers.loop import start_key
+from shapebody.optimizers.objective import Objective
+from shapebody.optimizers.pso import PSOConfig, pso
+from shapebody.optimizers.random_search import RandomConfig, random
+from shapebody.optimizers.search import METHODS, search
+from shapebody.optimizers.turbo import TuRBOConfig, turbo
+from shapebody.optimizers.vgds import VGDSConfig
+from shapebody.robot.robot import load_robot
 
 SMALL = {
     "vgds": dict(iterations=3),
@@ -540,7 +544,7 @@ def test_bo_leaves_pytorch_as_it_was(starts):
 
 @NO_BOTORCH
 def test_bo_begins_with_the_start_and_sobol_points():
-    from shapebody.search.bayesian import BOConfig, _Surrogate
+    from shapebody.optimizers.bayesian import BOConfig, _Surrogate
 
     start = uniform(5)
     points = _Surrogate(start, jax.random.key(0), BOConfig(initial_points=9)).initial()

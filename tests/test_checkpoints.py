@@ -14,19 +14,12 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays
 from tiny import quick_compilation, tiny_agent, tiny_robot
 
-from shapebody import checkpoints
-from shapebody.checkpoints import (
-    Agent,
-    agents,
-    atomic_write,
-    load_agent,
-    load_arrays,
-    load_curve,
-    provenance,
-    save_agent,
-    save_arrays,
-)
-from shapebody.descriptions import Descriptions
+from shapebody.agent import store
+from shapebody.agent.agent import Agent
+from shapebody.agent.store import agents, load_agent, load_curve, save_agent
+from shapebody.design.descriptions import Descriptions
+from shapebody.files import atomic_write, load_arrays, save_arrays
+from shapebody.provenance import provenance
 
 
 @pytest.fixture(scope="module")
@@ -421,4 +414,4 @@ def test_leaves_that_cannot_be_written_are_named(tmp_path):
 def test_agent_is_public():
     import shapebody
 
-    assert shapebody.Agent is Agent and shapebody.load_agent is checkpoints.load_agent
+    assert shapebody.Agent is Agent and shapebody.load_agent is store.load_agent

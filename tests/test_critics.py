@@ -7,11 +7,12 @@ import numpy as np
 import pytest
 from tiny import quick_compilation, tiny_agent, tiny_robot
 
-from shapebody import critics, studies
-from shapebody.design import DesignSpace
-from shapebody.evaluation import EvaluationConfig, evaluate, paired_gain
-from shapebody.locomotion import TaskConfig
-from shapebody.search import search
+from shapebody.design.space import DesignSpace
+from shapebody.evaluation.evaluate import EvaluationConfig, evaluate
+from shapebody.evaluation.statistics import paired_gain
+from shapebody.optimizers.search import search
+from shapebody.reproduction import critic_ablation, value_studies
+from shapebody.task.config import TaskConfig
 
 SETTING = dict(starts=2, first_start=5, episodes=3, horizon=12)
 
@@ -37,7 +38,7 @@ def pair(robot):
 
 
 def test_records_are_what_search_and_evaluation_give(pair, robot):
-    records = critics.compare_critics(pair, robot, (20.0,), **SETTING)
+    records = critic_ablation.compare_critics(pair, robot, (20.0,), **SETTING)
     expected = [(None, None), ("one", 20.0), ("other", 20.0)]
     assert [(r["critic"], r["trust_region"]) for r in records[::2]] == expected
     assert [r["start"] for r in records] == [5, 6] * 3
@@ -48,7 +49,7 @@ def test_records_are_what_search_and_evaluation_give(pair, robot):
     returns = [r["returns"] for r in records[4:]]
     np.testing.assert_allclose(returns, score.returns, atol=1e-3)
     np.testing.assert_allclose([r["size"] for r in records[4:]], found[:, :3], atol=1e-4)
-    rows = critics.critic_gains(records)
+    rows = critic_ablation.critic_gains(records)
     assert rows[0]["critic"] is None and rows[0]["mean"] is None
     own = paired_gain(returns, [r["returns"] for r in records[:2]])
     assert (rows[2]["mean"], rows[2]["low"], rows[2]["high"]) == own[:3]
@@ -56,10 +57,12 @@ def test_records_are_what_search_and_evaluation_give(pair, robot):
 
 
 def test_correlations_are_each_critics_own(pair, robot):
-    values = studies.value_against_return(pair["one"], robot, designs=12, episodes=1, horizon=5)
+    values = value_studies.value_against_return(
+        pair["one"], robot, designs=12, episodes=1, horizon=5
+    )
     for record in values:
         record["return"] = record["predicted_value"]
-    rho = critics.critic_correlations(pair, robot, values)
+    rho = critic_ablation.critic_correlations(pair, robot, values)
     assert rho["one"][0] == pytest.approx(1)
     assert rho["other"][0] < 1
 
@@ -67,19 +70,21 @@ def test_correlations_are_each_critics_own(pair, robot):
 def test_another_policy_is_refused(pair, robot):
     stranger = replace(pair["one"], policy=jax.tree.map(lambda x: x + 1, pair["one"].policy))
     with pytest.raises(ValueError, match="one, stranger belong to 2 policies; expected one"):
-        critics.compare_critics({"one": pair["one"], "stranger": stranger}, robot, **SETTING)
+        critic_ablation.compare_critics(
+            {"one": pair["one"], "stranger": stranger}, robot, **SETTING
+        )
 
 
 def test_two_tasks_are_compared_and_kept(pair, robot, tmp_path, monkeypatch):
     monkeypatch.setenv("SHAPEBODY_DATA", str(tmp_path))
     monkeypatch.setenv("SHAPEBODY_SCALE", "reduced")
     short = dict(starts=2, episodes=2, horizon=3)
-    study = critics.critic_tasks(pair["one"], pair["other"], robot, **short)
+    study = critic_ablation.critic_tasks(pair["one"], pair["other"], robot, **short)
     assert len(study["records"]) == 2 + 2 * 2 * 2 + 2
     assert {r["critic"] for r in study["records"]} == {
         None,
         "task of the training",
         "task of the evaluation",
     }
-    monkeypatch.setattr(critics, "search", None)
-    assert critics.critic_tasks(pair["one"], pair["other"], robot, **short) == study
+    monkeypatch.setattr(critic_ablation, "search", None)
+    assert critic_ablation.critic_tasks(pair["one"], pair["other"], robot, **short) == study

@@ -21,8 +21,13 @@ import numpy as np
 import pytest
 from tiny import quick_compilation, tiny_agent, tiny_robot
 
-from shapebody import checkpoints, experiments, files, ppo, stored
-from shapebody.checkpoints import load_agent, load_curve, save_agent
+from shapebody import files, stored
+from shapebody.agent import store
+from shapebody.agent.store import load_agent, load_curve, save_agent
+from shapebody.reproduction import results as reproduction_results
+from shapebody.training import config as training_config
+from shapebody.training import policy_evaluation, progress, run_state
+from shapebody.training import trainer as training_trainer
 
 FAULTS = (ValueError, FileNotFoundError)
 VALUES = (None, True, "x", "", -1, 0, 1.5, 10**30, 1e308, [], {}, ["x"], {"x": 1}, [[1]])
@@ -43,11 +48,13 @@ def agent(robots):
 METADATA = {
     "steps": 64,
     "scale": "smoke",
-    "config": ppo._plain(ppo.TrainConfig.smoke("legs_2", robots=("legs_2", "legs_3"))),
+    "config": stored.plain(
+        training_config.TrainConfig.smoke("legs_2", robots=("legs_2", "legs_3"))
+    ),
     "phases": [{"from_step": 0, "config": {}, "robots": {"legs_2": "0"}}],
     "policy_evaluation": {"steps": 5, "config": {}},
 }
-ROWS = [{name: 128.0 * i for name in ppo.CURVE} | {"steps": 128 * i} for i in range(1, 5)]
+ROWS = [{name: 128.0 * i for name in progress.CURVE} | {"steps": 128 * i} for i in range(1, 5)]
 
 
 @pytest.fixture
@@ -112,9 +119,9 @@ def test_wrong_values_in_a_description(agent, folder):
     document["metadata"] = METADATA | {"config": {"robots": ["legs_2"]}}
     loaded = 0
     for variant, place in list(altered(document))[::3]:
-        own = {name: variant.get(name) for name in checkpoints._CONFIGURATION}
+        own = {name: variant.get(name) for name in store._CONFIGURATION}
         if place[0] != "configuration_hash":
-            variant["configuration_hash"] = checkpoints._text_hash(own)
+            variant["configuration_hash"] = store._text_hash(own)
         path.write_text(json.dumps(variant))
         try:
             other = load_agent(folder)
@@ -126,7 +133,9 @@ def test_wrong_values_in_a_description(agent, folder):
             loaded += 1
             if "config" in place or "scale" in place:
                 with pytest.raises(FAULTS, match=r"[a-z]{3}.*[;:]"):
-                    ppo.train_critic(other, other.critic_config, folder=folder.parent / "again")
+                    policy_evaluation.train_critic(
+                        other, other.critic_config, folder=folder.parent / "again"
+                    )
     assert loaded > 10
 
 
@@ -152,7 +161,7 @@ def npy(shape, data=b"", kind="<f4") -> bytes:
 def test_what_would_fill_the_memory_is_refused_before_it_is_expanded(agent, folder):
     """Zip bombs, and headers with shapes that no file holds."""
     sizes = agent.sizes
-    shapes = {k: s[1:] for k, (s, _) in checkpoints._state_shapes(sizes).items()}
+    shapes = {k: s[1:] for k, (s, _) in store._state_shapes(sizes).items()}
     weights, states = folder / "weights.safetensors", folder / "states.npz"
     whole = {path: path.read_bytes() for path in (weights, states)}
 
@@ -226,9 +235,9 @@ def test_a_name_leads_nowhere_else(agent, folder, monkeypatch, name):
     with pytest.raises(ValueError, match="name.* is .*expected the name of a file"):
         save_agent(replace(agent, name=name))
     with pytest.raises(ValueError, match="name.* is .*expected the name of a file"):
-        ppo.TrainConfig.smoke("unitree_go2", name=name)
+        training_config.TrainConfig.smoke("unitree_go2", name=name)
     with pytest.raises(ValueError, match="name"):
-        ppo.train_critic(replace(agent, name=name), agent.critic_config)
+        policy_evaluation.train_critic(replace(agent, name=name), agent.critic_config)
     assert sorted(folder.parent.rglob("*")) == before
 
 
@@ -241,7 +250,7 @@ def test_a_copy_is_known_by_its_folder(agent, tmp_path, monkeypatch):
     other = tiny_agent(*[tiny_robot(tmp_path, n) for n in (2, 3)], states=5, seed=1)
     save_agent(other)
     with pytest.raises(ValueError, match="has another policy than agent 'tiny'.*folder="):
-        ppo.train_critic(agent, agent.critic_config)
+        policy_evaluation.train_critic(agent, agent.critic_config)
 
 
 # writers that are killed
@@ -360,17 +369,17 @@ def compute():
 
 
 def test_damaged_results(results, agent):
-    whole = experiments.result("x", compute, agent, starts=2)
+    whole = reproduction_results.result("x", compute, agent, starts=2)
     path = results / "x.json"
     data = path.read_bytes()
     texts = [json.dumps(x).encode() for x, _ in altered(json.loads(data))]
     for variant in (*damaged(data, 12), *texts[::4]):
         path.write_bytes(variant)
-        assert isinstance(experiments.stored_config("x", agent), dict | None)
+        assert isinstance(reproduction_results.stored_config("x", agent), dict | None)
         for read in (
-            lambda: experiments.result("x", compute, agent, starts=2),
-            lambda: experiments.stored_parts("x", agent, starts=2),
-            lambda: experiments.stored_result(path),
+            lambda: reproduction_results.result("x", compute, agent, starts=2),
+            lambda: reproduction_results.stored_parts("x", agent, starts=2),
+            lambda: reproduction_results.stored_result(path),
         ):
             path.write_bytes(variant)
             try:
@@ -378,9 +387,9 @@ def test_damaged_results(results, agent):
             except ValueError as error:
                 assert str(path) in str(error)
         path.write_bytes(variant)
-        anew = experiments.result("x", compute, agent, recompute=True, starts=2)
+        anew = reproduction_results.result("x", compute, agent, recompute=True, starts=2)
         assert str(anew["records"]) == str(whole["records"])
-        assert experiments.stored_parts("x", agent, starts=2)[-1:] == ["all"]
+        assert reproduction_results.stored_parts("x", agent, starts=2)[-1:] == ["all"]
         for old in results.glob("*.old*"):
             assert old.read_bytes() == variant  # kept
             old.unlink()
@@ -392,7 +401,7 @@ def test_two_writers_lose_no_parts(results, agent):
     def work(letter):
         begin.wait()
         parts = {f"{letter}{i}": compute for i in range(8)}
-        experiments.result_in_parts("x", parts, agent, starts=2)
+        reproduction_results.result_in_parts("x", parts, agent, starts=2)
 
     threads = [threading.Thread(target=work, args=letter) for letter in "abc"]
     [thread.start() for thread in threads]
@@ -403,12 +412,12 @@ def test_two_writers_lose_no_parts(results, agent):
 
 
 def test_a_full_disk_leaves_the_results(results, agent, monkeypatch):
-    experiments.result("x", compute, agent, starts=2)
+    reproduction_results.result("x", compute, agent, starts=2)
     before = (results / "x.json").read_bytes()
     monkeypatch.setattr(os, "fsync", full_disk)
     for starts in (2, 3):
         with pytest.raises(OSError, match="x.json cannot be written: No space left"):
-            experiments.result("x", compute, agent, recompute=True, starts=starts)
+            reproduction_results.result("x", compute, agent, recompute=True, starts=starts)
         assert [path.name for path in results.iterdir()] == ["x.json"]
         assert (results / "x.json").read_bytes() == before
 
@@ -418,13 +427,13 @@ def test_a_full_disk_leaves_the_results(results, agent, monkeypatch):
 
 def test_a_damaged_learning_curve_does_not_stop_a_run(tmp_path, capsys):
     path = tmp_path / "training.csv"
-    path.write_text(checkpoints._csv(ROWS))
+    path.write_text(store._csv(ROWS))
     whole = path.read_bytes()
     for variant in (*damaged(whole, 60), whole.replace(b"steps", b"stips")):
         path.write_bytes(variant)
-        ppo._Curve(path, steps=384)
+        progress._Curve(path, steps=384)
         columns, kept = path.read_text().splitlines(), tmp_path / "training.damaged.csv"
-        assert columns[0].split(",") == ppo.CURVE and len(columns) <= 4
+        assert columns[0].split(",") == progress.CURVE and len(columns) <= 4
         assert all(float(cell) >= 0 or cell for line in columns[1:] for cell in line.split(","))
         assert kept.exists() == ("was damaged" in capsys.readouterr().out)
         if kept.exists():
@@ -435,7 +444,7 @@ def test_a_damaged_learning_curve_does_not_stop_a_run(tmp_path, capsys):
 @pytest.fixture(scope="module")
 def config(robots):
     robot = robots[0]
-    return ppo.TrainConfig.smoke(
+    return training_config.TrainConfig.smoke(
         str(robot.path), num_envs=16, minibatch_size=64, epochs=1, total_steps=128 * 8
     )
 
@@ -444,7 +453,7 @@ def config(robots):
 def run(config, tmp_path_factory):
     """A run of one iteration, and its trainer, which the tests give other folders."""
     with quick_compilation():
-        trainer = ppo.Trainer(config, tmp_path_factory.mktemp("run"))
+        trainer = training_trainer.Trainer(config, tmp_path_factory.mktemp("run"))
         trainer.start()
         trainer.run(max_steps=config.batch, progress=False)
         yield trainer
@@ -456,7 +465,7 @@ def files_of(folder):
 
 def test_a_run_of_damaged_files_goes_on_as_it_was_or_not_at_all(run, config):
     whole = files_of(run.folder)
-    assert {*ppo.STATE_FILES} == set(whole)
+    assert {*run_state.STATE_FILES} == set(whole)
     run.start()
     before = [np.asarray(x) for x in jax.tree.leaves(run._everything())]
     trainer = copy.copy(run)
@@ -469,9 +478,9 @@ def test_a_run_of_damaged_files_goes_on_as_it_was_or_not_at_all(run, config):
             ]
         for variant in variants:
             (run.folder / name).write_bytes(variant)
-            assert ppo.as_continued(config, run.folder).robots
+            assert run_state.as_continued(config, run.folder).robots
             try:
-                assert ppo._engine(run.folder, "auto")
+                assert run_state._engine(run.folder, "auto")
                 trainer.start()
             except FAULTS as error:
                 assert name in str(error) or "the run in" in str(error), error
@@ -517,9 +526,9 @@ def test_another_working_directory_trains_the_same_robot(run, robots, tmp_path, 
 
     def trainer(*robots):
         config = replace(run.config, robots=robots, standardize=False)
-        return ppo.Trainer(config, tmp_path / "run")
+        return training_trainer.Trainer(config, tmp_path / "run")
 
-    monkeypatch.setattr(ppo, "Locomotion", environment)
+    monkeypatch.setattr("shapebody.training.trainer.Locomotion", environment)
     here, there = tmp_path / "here", tmp_path / "there"
     for place in (here, there):
         place.mkdir()
@@ -540,13 +549,13 @@ def test_another_working_directory_trains_the_same_robot(run, robots, tmp_path, 
     with pytest.raises(ValueError, match="legs_2 has changed since the run in run began"):
         trainer("legs_2.xml").start()
     config = replace(first.config, robots=("legs_2.xml",))
-    assert ppo.as_continued(config, tmp_path / "run") == config
+    assert run_state.as_continued(config, tmp_path / "run") == config
     (here / "legs_2.xml").rename(there / "legs_2.xml")
     assert trainer("legs_2.xml").start()
     (there / "legs_2.xml").write_text(other)
     agent.metadata["config"]["robots"] = [str(there / "legs_2.xml")]
     with pytest.raises(ValueError, match="file of robot legs_2 has changed since agent"):
-        ppo.train_critic(agent, agent.critic_config, folder=tmp_path / "agent")
+        policy_evaluation.train_critic(agent, agent.critic_config, folder=tmp_path / "agent")
 
 
 def test_a_robot_whose_simulation_always_fails_stops_the_training(run, tmp_path, monkeypatch):
@@ -565,9 +574,9 @@ def test_a_robot_whose_simulation_always_fails_stops_the_training(run, tmp_path,
     with pytest.raises(ValueError, match="simulation of robot 'legs_2' fails in every.*validate"):
         trainer.run(progress=False)
     assert trainer.steps <= begun + 2 * run.config.batch
-    monkeypatch.setattr(ppo.Locomotion, "with_task", lambda self, task: self)
+    monkeypatch.setattr("shapebody.task.env.Locomotion.with_task", lambda self, task: self)
     assert trainer.state_bank() is None
     assert trainer.save_agent(tmp_path / "agent").states is None
     assert load_agent(tmp_path / "agent").num_states == 0
     with pytest.raises(ValueError, match="state_bank is 100000000; expected an integer from 1"):
-        ppo.Trainer(replace(run.config, state_bank=10**8), tmp_path / "run")
+        training_trainer.Trainer(replace(run.config, state_bank=10**8), tmp_path / "run")

@@ -12,9 +12,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
-from shapebody.descriptions import Descriptions, Sizes, describe, kinematics, symmetric_feet
-from shapebody.design import DesignSpace
-from shapebody.robots import COLLISION_GROUP, load_robot
+from shapebody.design.descriptions import Descriptions, Sizes, describe, symmetric_feet
+from shapebody.design.kinematics import kinematics
+from shapebody.design.space import DesignSpace
+from shapebody.robot.robot import load_robot
+from shapebody.robot.spec_edits import COLLISION_GROUP
 
 ROBOTS = ("unitree_go2", "mit_humanoid", "golem")
 FIELDS = [field.name for field in dataclasses.fields(Descriptions)]

@@ -11,16 +11,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
-from shapebody.design import (
-    MODEL_FIELDS,
-    DesignSpace,
-    Embodiment,
-    published_axes,
-    published_axes_seed,
-)
-from shapebody.mjcf import TIGHT_RANGE, balanced, ordered_ranges
-from shapebody.parameters import BLOCKS, KINDS, part_label
-from shapebody.robots import load_robot
+from shapebody.design.export import TIGHT_RANGE, balanced, ordered_ranges
+from shapebody.design.parameters import BLOCKS, KINDS, part_label
+from shapebody.design.phi import MODEL_FIELDS, Embodiment, published_axes, published_axes_seed
+from shapebody.design.space import DesignSpace
+from shapebody.robot.robot import load_robot
 
 ROBOTS = ("unitree_go2", "mit_humanoid", "golem")
 FIELDS = [field.name for field in dataclasses.fields(Embodiment)]

@@ -7,18 +7,15 @@ import numpy as np
 import pytest
 from tiny import quick_compilation, tiny_agent, tiny_robot
 
-from shapebody.checkpoints import load_agent
-from shapebody.design import DesignSpace
-from shapebody.evaluation import (
-    EvaluationConfig,
-    bootstrap_interval,
-    evaluate,
-    paired_gain,
-)
-from shapebody.experiments import derived_constants
-from shapebody.locomotion import Locomotion, TaskConfig
+from shapebody.agent.store import load_agent
+from shapebody.design.space import DesignSpace
+from shapebody.evaluation.evaluate import EvaluationConfig, evaluate
+from shapebody.evaluation.statistics import bootstrap_interval, paired_gain
 from shapebody.physics.native import NativePhysics
-from shapebody.robots import load_robot
+from shapebody.reproduction.derived_constants import derived_constants
+from shapebody.robot.robot import load_robot
+from shapebody.task.config import TaskConfig
+from shapebody.task.env import Locomotion
 
 HORIZON = 40
 TASK = TaskConfig.evaluation(horizon=HORIZON)

@@ -8,8 +8,9 @@ import pytest
 from test_baselines import Quadratic, draws
 from tiny import quick_compilation
 
-from shapebody.search.directions import ARSConfig, ars
-from shapebody.search.populations import DEConfig, PSOConfig, de, pso
+from shapebody.optimizers.ars import ARSConfig, ars
+from shapebody.optimizers.de import DEConfig, de
+from shapebody.optimizers.pso import PSOConfig, pso
 
 evosax = pytest.importorskip("evosax", reason="evosax is not installed")
 algorithms = pytest.importorskip("evosax.algorithms")

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 from shapebody import exercises
-from shapebody.design import DesignSpace
-from shapebody.locomotion.rewards import TERMS
-from shapebody.robots import load_robot
-from shapebody.search import SearchResult
+from shapebody.design.space import DesignSpace
+from shapebody.optimizers.search import SearchResult
+from shapebody.robot.robot import load_robot
+from shapebody.task.rewards import TERMS
 
 
 @pytest.fixture(scope="module")
@@ -471,8 +471,8 @@ def test_cem_generation(capsys):
 
 
 def test_the_exercise_is_what_cem_does():
-    from shapebody.search.loop import Scored
-    from shapebody.search.populations import _CEM, CEMConfig
+    from shapebody.optimizers.cem import _CEM, CEMConfig
+    from shapebody.optimizers.loop import Scored
 
     rng = np.random.default_rng(3)
     for spread in (0.3, 0.005):

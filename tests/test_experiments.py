@@ -3,8 +3,10 @@ import json
 import numpy as np
 import pytest
 
-from shapebody import experiments, studies
-from shapebody.checkpoints import Agent
+from shapebody.agent.agent import Agent
+from shapebody.evaluation import statistics
+from shapebody.reproduction import gains, scale
+from shapebody.reproduction import results as reproduction_results
 
 
 class Known(Agent):
@@ -41,17 +43,17 @@ class Computation:
 
 def test_scale_is_read_from_the_environment(monkeypatch):
     monkeypatch.delenv("SHAPEBODY_SCALE", raising=False)
-    assert experiments.scale() == "reduced"
+    assert scale.scale() == "reduced"
     monkeypatch.setenv("SHAPEBODY_SCALE", "smoke")
-    assert experiments.budget().starts == experiments.BUDGETS["smoke"].starts
+    assert scale.budget().starts == scale.BUDGETS["smoke"].starts
     monkeypatch.setenv("SHAPEBODY_SCALE", "huge")
     with pytest.raises(ValueError, match="huge.*smoke, reduced, full"):
-        experiments.scale()
+        scale.scale()
 
 
 def test_scales_table_has_a_row_per_scale():
-    rows = experiments.scales_table()
-    assert [row["scale"] for row in rows] == list(experiments.BUDGETS)
+    rows = scale.scales_table()
+    assert [row["scale"] for row in rows] == list(scale.BUDGETS)
     assert json.dumps(rows)
 
 
@@ -60,8 +62,8 @@ def test_scales_table_has_a_row_per_scale():
 
 def test_result_is_computed_once_and_loaded_afterwards(results):
     compute = Computation()
-    first = experiments.result("x", compute, AGENT, starts=2)
-    second = experiments.result("x", compute, AGENT, starts=2)
+    first = reproduction_results.result("x", compute, AGENT, starts=2)
+    second = reproduction_results.result("x", compute, AGENT, starts=2)
     assert compute.calls == 1
     assert first == second
     assert list(json.loads((results / "x.json").read_text())) == ["parts"]
@@ -71,32 +73,32 @@ def test_result_is_computed_once_and_loaded_afterwards(results):
 
 def test_result_of_another_agent_or_setting_is_computed_anew(results):
     compute = Computation()
-    experiments.result("x", compute, AGENT, starts=2)
-    experiments.result("x", compute, AGENT, starts=3)
+    reproduction_results.result("x", compute, AGENT, starts=2)
+    reproduction_results.result("x", compute, AGENT, starts=3)
     other = Known("5678")
-    stored = experiments.result("x", compute, other, starts=3)
+    stored = reproduction_results.result("x", compute, other, starts=3)
     assert compute.calls == 3
     assert stored["provenance"]["agent"]["hash"] == "5678"
     other.states_hash = "57"
-    experiments.result("x", compute, other, starts=3)
+    reproduction_results.result("x", compute, other, starts=3)
     assert compute.calls == 4
-    experiments.result("x", compute, other, recompute=True, starts=3)
+    reproduction_results.result("x", compute, other, recompute=True, starts=3)
     assert compute.calls == 5
 
 
 def test_full_scale_has_its_own_file(results, monkeypatch):
     monkeypatch.setenv("SHAPEBODY_SCALE", "full")
-    experiments.result("x", Computation(), AGENT)
+    reproduction_results.result("x", Computation(), AGENT)
     assert [path.name for path in results.iterdir()] == ["x_full.json"]
 
 
 def test_smoke_scale_neither_reads_nor_writes(results, monkeypatch):
     compute = Computation()
-    experiments.result("x", compute, AGENT)
+    reproduction_results.result("x", compute, AGENT)
     monkeypatch.setenv("SHAPEBODY_SCALE", "smoke")
     before = (results / "x.json").read_text()
-    assert experiments.result("x", compute, AGENT)["records"] == [{"call": 2}]
-    experiments.result("y", compute, AGENT)
+    assert reproduction_results.result("x", compute, AGENT)["records"] == [{"call": 2}]
+    reproduction_results.result("y", compute, AGENT)
     assert (results / "x.json").read_text() == before
     assert [path.name for path in results.iterdir()] == ["x.json"]
 
@@ -109,19 +111,19 @@ def test_damaged_file_is_reported_and_can_be_recomputed(results, text):
     results.mkdir()
     (results / "x.json").write_text(text)
     with pytest.raises(ValueError, match="x.json.*damaged.*recompute=True"):
-        experiments.result("x", Computation(), AGENT)
-    assert experiments.result("x", Computation(), AGENT, recompute=True)["records"]
+        reproduction_results.result("x", Computation(), AGENT)
+    assert reproduction_results.result("x", Computation(), AGENT, recompute=True)["records"]
 
 
 def test_interrupted_computation_leaves_the_file_as_it_was(results):
-    experiments.result("x", Computation(), AGENT)
+    reproduction_results.result("x", Computation(), AGENT)
     before = (results / "x.json").read_text()
 
     def interrupted():
         raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        experiments.result("x", interrupted, AGENT, recompute=True)
+        reproduction_results.result("x", interrupted, AGENT, recompute=True)
     assert (results / "x.json").read_text() == before
 
 
@@ -132,22 +134,22 @@ def test_parts_are_stored_one_by_one_and_an_interruption_keeps_them(results):
         raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        experiments.result_in_parts("x", {"one": one, "two": interrupted}, AGENT, starts=2)
-    stored = experiments.result_in_parts("x", {"one": one, "two": two}, AGENT, starts=2)
+        reproduction_results.result_in_parts("x", {"one": one, "two": interrupted}, AGENT, starts=2)
+    stored = reproduction_results.result_in_parts("x", {"one": one, "two": two}, AGENT, starts=2)
     assert (one.calls, two.calls) == (1, 1)
     assert stored["records"] == [{"call": 1}, {"call": 1}]
     # Another selection, in another order, is read from the same file.
     three = {"three": Computation(), "one": one}
-    assert len(experiments.result_in_parts("x", three, AGENT, starts=2)["records"]) == 2
+    assert len(reproduction_results.result_in_parts("x", three, AGENT, starts=2)["records"]) == 2
     assert list(json.loads((results / "x.json").read_text())["parts"]) == ["one", "two", "three"]
     assert one.calls == 1
     # Other settings make all parts another result. The old ones are kept beside it.
     before = (results / "x.json").read_text()
-    experiments.result_in_parts("x", {"one": one, "two": two}, AGENT, starts=3)
+    reproduction_results.result_in_parts("x", {"one": one, "two": two}, AGENT, starts=3)
     assert list(json.loads((results / "x.json").read_text())["parts"]) == ["one", "two"]
     assert (one.calls, two.calls) == (2, 2)
     assert (results / "x.old.json").read_text() == before
-    experiments.result_in_parts("x", {"one": one}, AGENT, starts=2)
+    reproduction_results.result_in_parts("x", {"one": one}, AGENT, starts=2)
     assert (results / "x.old.json").read_text() == before
     assert "one" in json.loads((results / "x.old2.json").read_text())["parts"]
 
@@ -157,13 +159,13 @@ def test_a_part_of_other_settings_of_its_own_is_computed_anew(results):
     parts = {"one": one, "two": two}
     for settings in ({"one": {"rate": (1, 2)}}, {"one": {"rate": (1, 2)}}, {"one": {"rate": 3}}):
         before = (results / "x.json").read_text() if (results / "x.json").exists() else None
-        experiments.result_in_parts("x", parts, AGENT, settings=settings)
+        reproduction_results.result_in_parts("x", parts, AGENT, settings=settings)
     assert (one.calls, two.calls) == (2, 1)
     assert (results / "x.old.json").read_text() == before, "the other result is kept"
     stored = json.loads((results / "x.json").read_text())["parts"]
     assert stored["one"]["provenance"]["settings"] == {"rate": 3}
-    assert experiments.stored_parts("x", AGENT, {"one": {"rate": 3}}) == ["two", "one"]
-    assert experiments.stored_parts("x", AGENT, {"one": {"rate": 4}}) == ["two"]
+    assert reproduction_results.stored_parts("x", AGENT, {"one": {"rate": 3}}) == ["two", "one"]
+    assert reproduction_results.stored_parts("x", AGENT, {"one": {"rate": 4}}) == ["two"]
 
 
 # gains
@@ -186,37 +188,37 @@ def synthetic(vgds=(7.0, 9.0, 8.0), penalty=(6.0, 7.5, 7.0)):
 
 
 def test_gains_are_paired_by_start():
-    rows = studies.gains(synthetic())
-    one = studies.gain(rows, "vgds", "penalty-only", 20.0)
+    rows = gains.gains(synthetic())
+    one = gains.gain(rows, "vgds", "penalty-only", 20.0)
     assert one["mean"] == pytest.approx((1 + 1.5 + 1) / 3)
     assert 1 <= one["low"] <= one["mean"] <= one["high"] <= 1.5
     assert (one["pairs"], one["positive"]) == (3, 3)
-    assert studies.gain(rows, "vgds", "start", 20.0)["mean"] == pytest.approx(6)
-    assert studies.gain(rows, "penalty-only", "start")["mean"] == pytest.approx(29 / 6)
-    reference = studies.gain(rows, "reference", "start")
+    assert gains.gain(rows, "vgds", "start", 20.0)["mean"] == pytest.approx(6)
+    assert gains.gain(rows, "penalty-only", "start")["mean"] == pytest.approx(29 / 6)
+    reference = gains.gain(rows, "reference", "start")
     assert (reference["mean"], reference["positive"]) == (pytest.approx(3), 3)
-    own = studies.gain(rows, "vgds", "reference", 20.0)
+    own = gains.gain(rows, "vgds", "reference", 20.0)
     assert (own["mean"], own["low"], own["high"]) == pytest.approx((0.5, 0.4, 0.6))
     assert (own["pairs"], own["positive"]) == (2, 2)
-    errors = studies.gains(synthetic(), "tracking_error")
-    reduced = studies.gain(errors, "penalty-only", "start")["mean"]
+    errors = gains.gains(synthetic(), "tracking_error")
+    reduced = gains.gain(errors, "penalty-only", "start")["mean"]
     assert reduced == pytest.approx(np.mean([1 / 6 - 1, 1 / 7.5 - 1 / 2, 1 / 7 - 1 / 3]))
 
 
 def test_gains_of_incomplete_records():
     with pytest.raises(ValueError, match="both need the same"):
-        studies.gains(synthetic(penalty=(6.0, 7.5)))
+        gains.gains(synthetic(penalty=(6.0, 7.5)))
     with pytest.raises(ValueError, match="0 evaluations of the reference"):
-        studies.gains(synthetic()[:9])
+        gains.gains(synthetic()[:9])
     with pytest.raises(ValueError, match="no gain of vgds over start at 5"):
-        studies.gain(studies.gains(synthetic()), "vgds", "start", 5.0)
+        gains.gain(gains.gains(synthetic()), "vgds", "start", 5.0)
 
 
 @pytest.mark.parametrize(
     "low, high, word", [(0.1, 1, "positive"), (-1, -0.1, "negative"), (-1, 1, "not settled")]
 )
 def test_verdict(low, high, word):
-    assert experiments.verdict(low, high).startswith(word)
+    assert statistics.verdict(low, high).startswith(word)
 
 
 def test_rank_correlation_agrees_with_scipy():
@@ -225,10 +227,10 @@ def test_rank_correlation_agrees_with_scipy():
     generator = np.random.default_rng(0)
     x = generator.normal(size=60)
     y = np.round(x + generator.normal(size=60), 1)  # with ties
-    rho, low, high = experiments.rank_correlation(x, y)
+    rho, low, high = statistics.rank_correlation(x, y)
     assert rho == pytest.approx(spearmanr(x, y).statistic)
     assert low < rho < high
-    assert experiments.rank_correlation(x, np.exp(x))[0] == pytest.approx(1)
-    assert np.isnan(experiments.rank_correlation(x, np.ones(60))[0])
+    assert statistics.rank_correlation(x, np.exp(x))[0] == pytest.approx(1)
+    assert np.isnan(statistics.rank_correlation(x, np.ones(60))[0])
     with pytest.raises(ValueError, match="three or more"):
-        experiments.rank_correlation([1, 2], [1, 2])
+        statistics.rank_correlation([1, 2], [1, 2])

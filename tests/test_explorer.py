@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 from walker import WALKER
 
-from shapebody import explorer
-from shapebody.design import DesignSpace
+from shapebody.design.space import DesignSpace
+from shapebody.show import scene as show_scene
 
 
 class Space(DesignSpace):
@@ -33,28 +33,29 @@ def commands(scene, kind):
 
 
 def test_scene_is_one_page_without_a_server():
-    page = explorer.show_design(Space()).static_html()
+    page = show_scene.show_design(Space()).static_html()
     assert "MeshCat.Viewer" in page and "@commands@" not in page
     assert 5e5 < len(page) < 1.2e6
 
 
 def test_scene_is_the_same_every_time():
     assert (
-        explorer.show_design(Space()).static_html() == explorer.show_design(Space()).static_html()
+        show_scene.show_design(Space()).static_html()
+        == show_scene.show_design(Space()).static_html()
     )
 
 
 def test_capsules_are_a_shaft_and_two_balls():
-    paths = {command["path"] for command in commands(explorer.show_design(Space()), "set_object")}
+    paths = {command["path"] for command in commands(show_scene.show_design(Space()), "set_object")}
     capsule = 4  # floor, box, ellipsoid, hidden sphere, capsule
     assert {f"/robot/geom_{capsule}{role}" for role in ("_shaft", "_top", "_bottom")} <= paths
     assert not any(path.startswith("/robot/geom_3") for path in paths)
-    shown = commands(explorer.show_design(Space(), spheres=True), "set_object")
+    shown = commands(show_scene.show_design(Space(), spheres=True), "set_object")
     assert "/robot/geom_3" in {command["path"] for command in shown}
 
 
 def test_foot_is_where_mujoco_puts_it():
-    scene = explorer.show_design(Space(), np.array([1.0]))
+    scene = show_scene.show_design(Space(), np.array([1.0]))
     foot = next(c for c in commands(scene, "set_transform") if c["path"] == "/robot/geom_6")
     matrix = np.reshape(foot["matrix"], (4, 4)).T
     assert matrix[:3, 3] == pytest.approx([0.1, 0, 0.04], abs=1e-4)
@@ -62,7 +63,7 @@ def test_foot_is_where_mujoco_puts_it():
 
 
 def test_animation_moves_only_what_changes():
-    scene = explorer.animate_designs(Space(), np.linspace(0, 1, 11)[:, None], frames=5)
+    scene = show_scene.animate_designs(Space(), np.linspace(0, 1, 11)[:, None], frames=5)
     (animation,) = commands(scene, "set_animation")
     tracks = {clip["path"]: clip["clip"]["tracks"] for clip in animation["animations"]}
     foot = {track["name"]: track["keys"] for track in tracks["/robot/geom_6"]}
@@ -72,7 +73,7 @@ def test_animation_moves_only_what_changes():
 
 
 def test_notebook_shows_it_in_a_frame(tmp_path):
-    scene = explorer.show_design(Space())
+    scene = show_scene.show_design(Space())
     shown = scene._repr_html_()
     assert shown.startswith("<iframe srcdoc=")
     assert shown == scene._repr_html_()
@@ -84,4 +85,4 @@ def test_notebook_shows_it_in_a_frame(tmp_path):
 
 def test_trajectory_of_several_starts_is_refused():
     with pytest.raises(ValueError, match="designs of one start"):
-        explorer.animate_designs(Space(), np.zeros((3, 4, 1)))
+        show_scene.animate_designs(Space(), np.zeros((3, 4, 1)))

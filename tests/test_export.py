@@ -16,11 +16,11 @@ from tiny import quick_compilation, tiny_agent
 
 from shapebody import load_robot, robots, validate_robot
 from shapebody.__main__ import main
-from shapebody.checkpoints import save_agent
-from shapebody.design import DesignSpace
-from shapebody.feet import foot_ids
-from shapebody.mjcf import balanced, ordered_ranges
+from shapebody.agent.store import save_agent
+from shapebody.design.export import balanced, ordered_ranges
+from shapebody.design.space import DesignSpace
 from shapebody.physics import MjxPhysics, NativePhysics
+from shapebody.robot.leg_ends import foot_ids
 
 SUBSTEPS = 4  # physics steps per control step
 SECONDS = 2.0

@@ -10,13 +10,17 @@ import numpy as np
 import pytest
 from tiny import quick_compilation
 
-from shapebody import paper, ppo
-from shapebody.catalog import random_bodies, robot_table
-from shapebody.descriptions import Sizes
-from shapebody.design import MODEL_FIELDS, DesignSpace
-from shapebody.locomotion import Locomotion, TaskConfig
-from shapebody.paths import data_dir
-from shapebody.robots import load_robot, robots
+from shapebody.design.descriptions import Sizes
+from shapebody.design.phi import MODEL_FIELDS
+from shapebody.design.space import DesignSpace
+from shapebody.files import data_dir
+from shapebody.reproduction import paper
+from shapebody.reproduction.robot_catalog import random_bodies, robot_table
+from shapebody.robot.robot import load_robot, robots
+from shapebody.task.config import TaskConfig
+from shapebody.task.env import Locomotion
+from shapebody.training import config as training_config
+from shapebody.training import trainer as training_trainer
 
 SMALL = {"quadruped": "bittle", "biped": "bolt", "humanoid": "robotis_op3", "hexapod": "crab"}
 """A robot of each morphology that compiles quickly."""
@@ -145,7 +149,7 @@ def everyone():
 @pytest.fixture(scope="module")
 def trained(everyone, tmp_path_factory):
     """Two iterations of PPO with one policy and one critic for all robots."""
-    config = ppo.TrainConfig.smoke(
+    config = training_config.TrainConfig.smoke(
         everyone[0].name,
         robots=tuple(robot.name for robot in everyone),
         name="fifty",
@@ -154,7 +158,7 @@ def trained(everyone, tmp_path_factory):
         minibatch_size=400,
         total_steps=1600,
     )
-    trainer = ppo.Trainer(config, tmp_path_factory.mktemp("fifty"), engine="native")
+    trainer = training_trainer.Trainer(config, tmp_path_factory.mktemp("fifty"), engine="native")
     trainer.start()
     before = jax.tree.map(np.array, trainer.learner.policy)
     trainer.run(progress=False)

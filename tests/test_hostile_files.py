@@ -16,9 +16,10 @@ from test_inference import MESH, biped_urdf, quadruped
 from test_robots import own_robot
 
 import shapebody as sb
-from shapebody import guard, survey
-from shapebody.reading import read
-from shapebody.robots import load_robot, robots
+from shapebody.files import data_dir
+from shapebody.robot import guard, survey
+from shapebody.robot.importing import read
+from shapebody.robot.robot import load_robot, robots
 
 PARTS = {"before": "", "attributes": "", "inside": "", "after": ""}
 SMALL = (
@@ -275,7 +276,7 @@ def test_joints_and_depth_of_what_was_compiled(tmp_path):
 
 
 def test_every_shipped_robot_would_pass():
-    folder = sb.paths.data_dir() / "robots"
+    folder = data_dir() / "robots"
     for name in robots():
         assert survey.files_of(folder / f"{name}.xml")
 
@@ -307,15 +308,15 @@ def test_a_reader_that_does_not_end(tmp_path, unsurveyed, monkeypatch):
 def test_memory_is_limited(tmp_path, unsurveyed):
     path = small(tmp_path, before='<size nuser_body="2000000000"/>')
     assert "memory" in refusal(path, seconds=20)
-    program = f"import shapebody.guard as g; g._limit_memory(); bytearray({2 * guard.MEMORY})"
+    program = f"import shapebody.robot.guard as g; g._limit_memory(); bytearray({2 * guard.MEMORY})"
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
     assert "MemoryError" in done.stderr
 
 
 PROGRAM = """
 import os
-from shapebody import guard
-from shapebody.reading import read
+from shapebody.robot import guard
+from shapebody.robot.importing import read
 from pathlib import Path
 survey, guard.files_of = guard.files_of, lambda path: {}
 try:

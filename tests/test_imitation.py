@@ -8,8 +8,10 @@ import numpy as np
 import pytest
 from tiny import quick_compilation, tiny_agent, tiny_robot
 
-from shapebody import imitation, ppo
-from shapebody.networks import CriticConfig, PolicyConfig
+from shapebody.networks.config import CriticConfig, PolicyConfig
+from shapebody.training import config as training_config
+from shapebody.training import imitation, train
+from shapebody.training import trainer as training_trainer
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -25,7 +27,7 @@ def robot(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def config(robot):
-    return ppo.TrainConfig.smoke(
+    return training_config.TrainConfig.smoke(
         robot.path,
         policy=PolicyConfig.reduced(key_widths=(12, 12), core_widths=(24, 12)),
         num_envs=16,
@@ -48,7 +50,7 @@ def test_the_student_acts_like_its_teacher(robot, config, tmp_path, capsys):
     bodies = jax.tree.map(lambda x: x[:, None], trainer.env.descriptions(0, f))
     wanted = np.asarray(teacher.act(bodies, teacher.states))
     student = trainer.agent().act(bodies, teacher.states)
-    fresh = ppo.Trainer(own, tmp_path / "fresh").agent().act(bodies, teacher.states)
+    fresh = training_trainer.Trainer(own, tmp_path / "fresh").agent().act(bodies, teacher.states)
     errors = [np.mean((np.asarray(x) - wanted) ** 2) for x in (student, fresh)]
     assert errors[0] < 0.5 * errors[1]
     # The critic is the teacher's, and the run goes on like any other.
@@ -57,7 +59,7 @@ def test_the_student_acts_like_its_teacher(robot, config, tmp_path, capsys):
     ):
         np.testing.assert_array_equal(a, b)
     assert trainer.steps == 0
-    agent = ppo.train(own, tmp_path, progress=False, max_steps=2 * config.batch)
+    agent = train.train(own, tmp_path, progress=False, max_steps=2 * config.batch)
     assert agent.metadata["steps"] == 2 * config.batch
     assert agent.metadata["phases"][0]["imitated"] == record
     before = (tmp_path / "training.safetensors").read_bytes()
@@ -79,6 +81,6 @@ def test_a_critic_of_other_sizes_starts_anew(robot, config, tmp_path):
     teacher = tiny_agent(robot)
     own = replace(config, critic=CriticConfig.reduced(heads=1, head_widths=(8,)))
     trainer = imitation.begin_run(own, teacher, steps=config.batch, folder=tmp_path, progress=False)
-    fresh = ppo.Trainer(own, tmp_path / "fresh").learner.critic
+    fresh = training_trainer.Trainer(own, tmp_path / "fresh").learner.critic
     for a, b in zip(jax.tree.leaves(trainer.learner.critic), jax.tree.leaves(fresh), strict=True):
         np.testing.assert_array_equal(a, b)

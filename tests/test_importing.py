@@ -7,8 +7,8 @@ import mujoco
 import numpy as np
 import pytest
 
-from shapebody.robots import load_robot
-from shapebody.validation import validate_robot
+from shapebody.robot.report import validate_robot
+from shapebody.robot.robot import load_robot
 
 LINK = """
   <link name="{name}"><inertial><mass value="{mass}"/>

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 from tiny import quick_compilation
 
-from shapebody.design import DesignSpace
-from shapebody.robots import load_robot
+from shapebody.design.space import DesignSpace
+from shapebody.robot.robot import load_robot
 
 # In the manner of public collections: default classes, meshes for looks, motors, no floor, no
 # keyframe, feet that are spheres named after the leg.
@@ -191,7 +191,7 @@ def test_designs_and_their_mjcf(robot, tmp_path):
 def test_one_step_of_the_task(robot):
     import jax
 
-    from shapebody.locomotion import Locomotion
+    from shapebody.task.env import Locomotion
 
     def still(params, key, descriptions, observation):
         return jax.numpy.zeros(observation.joints.shape[:2]), ()

@@ -8,9 +8,9 @@ import pytest
 from test_inference import FIXED, biped_urdf, edited_urdf, noted, quadruped
 from test_robots import KEY, OWN, RIGHT_ACTUATOR, RIGHT_HIP, own_robot
 
-from shapebody.robots import load_robot, robots
-from shapebody.standing import FLAT, hold, leg_drop, steady_armature
-from shapebody.validation import validate_robot
+from shapebody.robot.report import validate_robot
+from shapebody.robot.robot import load_robot, robots
+from shapebody.robot.standing import FLAT, hold, leg_drop, steady_armature
 
 MOTOR = '<motor joint="{0}" ctrlrange="-6 6"/>'
 LEGS = (("fl", 0.2, 0.1), ("fr", 0.2, -0.1), ("rl", -0.2, 0.1), ("rr", -0.2, -0.1))

@@ -10,19 +10,12 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from shapebody.descriptions import Sizes
-from shapebody.locomotion import (
-    CONTROL_STEP,
-    TERMS,
-    Locomotion,
-    TaskConfig,
-    curriculum,
-    episode,
-    observations,
-    randomization,
-    rewards,
-)
-from shapebody.robots import load_robot
+from shapebody.design.descriptions import Sizes
+from shapebody.robot.robot import load_robot
+from shapebody.task import curriculum, episode, observations, randomization, rewards
+from shapebody.task.config import CONTROL_STEP, TaskConfig
+from shapebody.task.env import Locomotion
+from shapebody.task.rewards import TERMS
 
 QUIET = dict(
     noise_joint_position=0.0,

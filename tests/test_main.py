@@ -7,10 +7,9 @@ from pathlib import Path
 import pytest
 from tiny import tiny_agent, tiny_robot
 
-from shapebody import ppo
 from shapebody.__main__ import main
-from shapebody.checkpoints import load_agent, save_agent
-from shapebody.robots import load_robot
+from shapebody.agent.store import load_agent, save_agent
+from shapebody.robot.robot import load_robot
 
 
 @pytest.fixture(scope="module")
@@ -33,14 +32,18 @@ def test_options_of_training(files, monkeypatch):
     robot, agent = files
     monkeypatch.setenv("XLA_FLAGS", "")  # which `main` sets
     calls = []
-    monkeypatch.setattr(ppo, "train", lambda config, **given: calls.append(given))
-    monkeypatch.setattr(ppo, "anneal", lambda name, steps, **given: calls.append(given))
+    monkeypatch.setattr(
+        "shapebody.training.train.train", lambda config, **given: calls.append(given)
+    )
+    monkeypatch.setattr(
+        "shapebody.training.train.anneal", lambda name, steps, **given: calls.append(given)
+    )
 
     def train_critic(agent, *unnamed, **given):
         calls.append(given)
         return agent
 
-    monkeypatch.setattr(ppo, "train_critic", train_critic)
+    monkeypatch.setattr("shapebody.training.policy_evaluation.train_critic", train_critic)
     options = ["--engine", "mjx", "--hours", "2"]
     assert main(["train", robot, "--replace", "--steps", "9", *options]) == 0
     assert main(["anneal", "any", "--replace", *options]) == 0
@@ -61,7 +64,7 @@ def test_design_looks_at_its_output_before_it_searches(files, monkeypatch, tmp_p
     def never(*arguments, **options):
         raise AssertionError("searched")
 
-    monkeypatch.setattr(sys.modules["shapebody.search"], "search", never)
+    monkeypatch.setattr(sys.modules["shapebody.optimizers"], "search", never)
     assert main(["design", robot, "--agent", agent, "--out", robot]) == 1
     assert "the file of the robot itself" in capsys.readouterr().err
     assert main(["design", robot, "--agent", agent, "--out", str(tmp_path)]) == 1
@@ -105,6 +108,6 @@ def test_an_interrupt_is_no_traceback(monkeypatch, capsys):
         raise KeyboardInterrupt
 
     monkeypatch.setenv("XLA_FLAGS", "")
-    monkeypatch.setattr(ppo, "anneal", interrupt)
+    monkeypatch.setattr("shapebody.training.train.anneal", interrupt)
     assert main(["anneal", "any"]) == 130
     assert capsys.readouterr().err == "shapebody: interrupted\n"

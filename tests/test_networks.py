@@ -8,7 +8,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from shapebody.networks import (
+from shapebody.networks.config import CriticConfig, PolicyConfig
+from shapebody.networks.critic import Critic
+from shapebody.networks.inputs import (
     FOOT_DESCRIPTION,
     FOOT_OBSERVATION,
     GENERAL,
@@ -17,19 +19,13 @@ from shapebody.networks import (
     JOINT_OBSERVATION,
     PRIVILEGED,
     STATIC,
-    Critic,
-    CriticConfig,
-    Policy,
-    PolicyConfig,
-    aggregate,
     count_parameters,
-    elu,
-    entropy,
     initialize,
-    log_prob,
     standardization,
 )
-from shapebody.published import load_published_policy
+from shapebody.networks.policy import Policy, entropy, log_prob
+from shapebody.networks.published import load_published_policy
+from shapebody.networks.urma import aggregate, elu
 
 # Wide key layers would only slow these tests down; nothing below depends on the sizes.
 SMALL_POLICY = PolicyConfig((12, 8), 3, (16, 8), initial_temperature=0.3, latent_scale=4.0)

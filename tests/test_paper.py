@@ -2,9 +2,10 @@ import dataclasses
 
 import pytest
 
-from shapebody import load_robot, paper
-from shapebody.networks import PolicyConfig
-from shapebody.ppo import TrainConfig
+from shapebody import load_robot
+from shapebody.networks.config import PolicyConfig
+from shapebody.reproduction import paper
+from shapebody.training.config import TrainConfig
 
 
 def test_values_that_the_paper_gives_twice_agree():

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 import shapebody as sb
-from shapebody.design import MODEL_FIELDS
-from shapebody.physics import home_sensordata, prepare
+from shapebody.design.phi import MODEL_FIELDS
 from shapebody.physics.native import NativePhysics
+from shapebody.physics.protocol import home_sensordata, prepare
 
 N = 8
 STEPS = 25

@@ -2,7 +2,8 @@ import matplotlib.pyplot as plt
 import numpy as np
 import pytest
 
-from shapebody import load_agent, plots
+from shapebody import load_agent
+from shapebody.show import plots, tables
 
 
 @pytest.fixture
@@ -37,7 +38,7 @@ def test_smoothing_draws_nothing_where_nothing_is_known(tmp_path):
 
 def test_agents_table():
     agents = [load_agent(name) for name in ("unitree_go2", "golem")]
-    first, second = plots.agents_table(agents).rows
+    first, second = tables.agents_table(agents).rows
     assert first[0] == "unitree_go2" and first[1].endswith(" million")
     assert 0 < float(second[2]) <= 1
     assert "million, " in second[3] and second[3].endswith(" actions")
@@ -52,7 +53,7 @@ def test_missing_column_is_named(curve):
 
 
 def test_paper_table():
-    table = plots.paper_table(
+    table = tables.paper_table(
         [("return", 42.6, (41.97, 0.312)), ("steps", None, 13_000_000)], note="ours (reduced)"
     )
     assert table.markdown().splitlines()[2:] == [
@@ -64,12 +65,12 @@ def test_paper_table():
 
 
 def test_table_escapes_html():
-    assert "&lt;b&gt;" in plots.table([("<b>", 1)], ("a", "b"))._repr_html_()
+    assert "&lt;b&gt;" in tables.table([("<b>", 1)], ("a", "b"))._repr_html_()
 
 
 def test_ragged_rows_are_refused():
     with pytest.raises(ValueError, match="3 cells"):
-        plots.table([(1, 2, 3)], ("a", "b"))
+        tables.table([(1, 2, 3)], ("a", "b"))
 
 
 def test_intervals_have_one_row_each():

@@ -12,11 +12,15 @@ import numpy as np
 import optax
 import pytest
 
-from shapebody import ppo
-from shapebody.checkpoints import load_agent, load_curve, save_agent
+from shapebody.agent.store import load_agent, load_curve, save_agent
 from shapebody.files import alone_in
-from shapebody.locomotion.observations import Observation
-from shapebody.networks import CriticConfig
+from shapebody.networks.config import CriticConfig
+from shapebody.stored import from_plain, plain
+from shapebody.task.observations import Observation
+from shapebody.training import config as training_config
+from shapebody.training import losses, policy_evaluation, progress, run_state, train
+from shapebody.training import trainer as training_trainer
+from shapebody.training import update as training_update
 
 
 def test_advantages_against_a_plain_loop():
@@ -27,7 +31,7 @@ def test_advantages_against_a_plain_loop():
     terminated = rng.random((n, t)) < 0.2
     truncated = rng.random((n, t)) < 0.2  # a fall counts, whatever else happens in its step
     assert np.any(terminated & truncated)
-    got = ppo.advantages(reward, value, last, terminated, truncated, discount, lam)
+    got = losses.advantages(reward, value, last, terminated, truncated, discount, lam)
     for i in range(n):
         advantage = 0.0
         for k in reversed(range(t)):
@@ -50,14 +54,14 @@ def test_command_changes():
     command[1, :, 0] = np.arange(4)  # angular velocity changes in every step
     observation = Observation(joints=None, feet=None, general=command, privileged=None)
     last = replace(observation, general=np.array(command[:, -1]))
-    changes = ppo.command_changes(observation, last)
+    changes = losses.command_changes(observation, last)
     np.testing.assert_array_equal(changes, [[False, True, False, False], [False] * 4])
     last.general[1, 5] = -0.1  # a new yaw rate after the last step
-    assert ppo.command_changes(observation, last)[1].tolist() == [False, False, False, True]
+    assert losses.command_changes(observation, last)[1].tolist() == [False, False, False, True]
 
 
 def test_configurations():
-    full = ppo.TrainConfig.full("unitree_go2")
+    full = training_config.TrainConfig.full("unitree_go2")
     assert (full.num_envs, full.rollout_length, full.minibatch_size) == (4096, 64, 16384)
     assert full.learning_rate == (1.5e-3, 3e-4) and full.epochs == 10
     assert (full.discount, full.gae_lambda, full.clip_range) == (0.99, 0.7, 0.1)
@@ -72,7 +76,7 @@ def test_configurations():
     for environments in (7_680, 15_040):  # the paper's other runs
         assert replace(full, num_envs=environments).minibatch_size == 16_384
     with pytest.raises(ValueError, match="scale is 'huge'"):
-        ppo.TrainConfig.at_scale("huge", "unitree_go2")
+        training_config.TrainConfig.at_scale("huge", "unitree_go2")
 
 
 @pytest.mark.parametrize(
@@ -111,7 +115,7 @@ def test_configurations():
 )
 def test_configurations_without_sense(name, value):
     with pytest.raises(ValueError, match=f"{name} is .*; expected"):
-        ppo.TrainConfig.reduced("unitree_go2", **{name: value})
+        training_config.TrainConfig.reduced("unitree_go2", **{name: value})
 
 
 @pytest.mark.parametrize(
@@ -120,24 +124,24 @@ def test_configurations_without_sense(name, value):
 )
 def test_configurations_of_wrong_kinds(name, value):
     with pytest.raises((TypeError, ValueError), match=f"{name} is .*; expected"):
-        ppo.TrainConfig.reduced("unitree_go2", **{name: value})
+        training_config.TrainConfig.reduced("unitree_go2", **{name: value})
     with pytest.raises(ValueError, match="scale is 'huge'; expected one of smoke, reduced, full"):
-        ppo.TrainConfig.reduced("unitree_go2", scale="huge")
+        training_config.TrainConfig.reduced("unitree_go2", scale="huge")
 
 
 def test_robots_may_be_paths():
-    config = ppo.TrainConfig.reduced(Path("here") / "bolt.xml")
+    config = training_config.TrainConfig.reduced(Path("here") / "bolt.xml")
     assert config.robots == (str(Path("here") / "bolt.xml"),) and config.name == "bolt"
 
 
 @pytest.fixture(scope="module")
 def config():
-    return ppo.TrainConfig.smoke("unitree_go2", total_steps=128 * 5)
+    return training_config.TrainConfig.smoke("unitree_go2", total_steps=128 * 5)
 
 
 def begin(config, folder, engine="auto"):
     """A trainer whose bodies differ, since it begins at c = 0.5; or the one to be continued."""
-    trainer = ppo.Trainer(config, folder, engine)
+    trainer = training_trainer.Trainer(config, folder, engine)
     if not trainer.start():
         env = trainer.env
         trainer.state = env.reset(trainer.key, coefficient=0.5, spread=True)
@@ -181,7 +185,7 @@ def test_a_run_goes_on_in_the_same_process(config, straight, tmp_path):
 
 
 def test_a_crash_while_saving_loses_nothing(config, straight, tmp_path, monkeypatch):
-    trainer = ppo.Trainer(config, tmp_path)
+    trainer = training_trainer.Trainer(config, tmp_path)
     trainer.start()
     trainer.run(max_steps=128, progress=False)
     before = (tmp_path / "training.safetensors").read_bytes()
@@ -194,32 +198,34 @@ def test_a_crash_while_saving_loses_nothing(config, straight, tmp_path, monkeypa
         trainer.run(max_steps=256, progress=False)
     monkeypatch.undo()
     assert (tmp_path / "training.safetensors").read_bytes() == before
-    again = ppo.Trainer(config, tmp_path)
+    again = training_trainer.Trainer(config, tmp_path)
     assert again.start() and again.steps == 128
 
 
 def test_an_interrupt_saves_an_agent_only_after_an_iteration(config, tmp_path, monkeypatch, capsys):
     with pytest.raises(ValueError, match="max_steps is 127; one iteration is 128 steps"):
-        ppo.train(config, tmp_path / "none", max_steps=127)
+        train.train(config, tmp_path / "none", max_steps=127)
     assert not (tmp_path / "none").exists()
 
     def interrupt(*args):
         raise KeyboardInterrupt
 
     with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
-        patch.setattr(ppo.Trainer, "_collect", interrupt)
-        ppo.train(config, tmp_path)
+        patch.setattr(training_trainer.Trainer, "_collect", interrupt)
+        train.train(config, tmp_path)
     assert capsys.readouterr().out.endswith("before the first iteration: nothing was saved\n")
     assert not list(tmp_path.glob("agent.json")) + list(tmp_path.glob("*.safetensors"))
     # In the third iteration, after the update and before the state is saved.
-    save = ppo.Trainer.save
-    monkeypatch.setattr(ppo.Trainer, "save", lambda t: interrupt() if t.steps > 256 else save(t))
-    agent = ppo.train(config, tmp_path)
+    save = training_trainer.Trainer.save
+    monkeypatch.setattr(
+        training_trainer.Trainer, "save", lambda t: interrupt() if t.steps > 256 else save(t)
+    )
+    agent = train.train(config, tmp_path)
     assert capsys.readouterr().out.endswith("interrupted: saved, the same call continues\n")
     assert agent.metadata["steps"] == 256 and load_agent(tmp_path).hash == agent.hash
     monkeypatch.undo()
     # The agent is that of the run as it is on disk, so the same call continues.
-    agent = ppo.train(config, tmp_path, progress=False, max_steps=384)
+    agent = train.train(config, tmp_path, progress=False, max_steps=384)
     assert agent.metadata["steps"] == 384
 
 
@@ -229,28 +235,28 @@ def test_an_agent_is_not_replaced_by_one_with_fewer_steps(config, tmp_path):
     description.write_text('{"metadata": {"steps": 34000}}')
     arguments = dict(folder=tmp_path, progress=False)
     with pytest.raises(ValueError, match=r"34,000 steps.* it 0;.*replace=True.*state_only=True"):
-        ppo.train(config, **arguments)
-    assert ppo.train(config, max_steps=64, state_only=True, **arguments) is None
+        train.train(config, **arguments)
+    assert train.train(config, max_steps=64, state_only=True, **arguments) is None
     with pytest.raises(ValueError, match=r"34,000 steps.* it 64;"):
-        ppo.train(config, **arguments)
+        train.train(config, **arguments)
     assert "34000" in description.read_text()
-    agent = ppo.train(config, max_steps=128, replace=True, **arguments)
+    agent = train.train(config, max_steps=128, replace=True, **arguments)
     assert load_agent(tmp_path).hash == agent.hash
 
 
 def test_a_call_that_trains_nothing_leaves_the_agent(config, tmp_path, monkeypatch):
     config = replace(config, num_envs=8, minibatch_size=32, epochs=1)
     arguments = dict(folder=tmp_path, progress=False, max_steps=64)
-    trainer = ppo.Trainer(config, tmp_path)
-    monkeypatch.setattr(ppo, "Trainer", lambda *_: trainer)  # compiled once
-    agent = ppo.train(config, **arguments)
+    trainer = training_trainer.Trainer(config, tmp_path)
+    monkeypatch.setattr("shapebody.training.train.Trainer", lambda *_: trainer)  # compiled once
+    agent = train.train(config, **arguments)
     # Another critic, as train_critic saves it; then an agent of more steps, as anneal does.
     critic = jax.tree.map(lambda x: x + 1, agent.critic)
     for steps in (64, 128):
         metadata = {**agent.metadata, "steps": steps, "policy_evaluation": {}}
         save_agent(replace(agent, critic=critic, metadata=metadata), tmp_path)
         files = {file: file.read_bytes() for file in tmp_path.iterdir()}
-        again = ppo.train(config, **arguments)
+        again = train.train(config, **arguments)
         assert again.hash == load_agent(tmp_path).hash != agent.hash
         assert again.metadata["steps"] == steps and "policy_evaluation" in again.metadata
         assert {file: file.read_bytes() for file in tmp_path.iterdir()} == files
@@ -258,55 +264,55 @@ def test_a_call_that_trains_nothing_leaves_the_agent(config, tmp_path, monkeypat
     arguments["max_steps"] = 192
     save_agent(replace(again, metadata=again.metadata | {"steps": 64}), tmp_path)
     with pytest.raises(ValueError, match="critic from policy evaluation.*--state-only"):
-        ppo.train(config, **arguments)
+        train.train(config, **arguments)
     assert load_agent(tmp_path).hash == again.hash
     arguments["max_steps"] = 64
-    assert ppo.train(config, replace=True, **arguments).hash == load_agent(tmp_path).hash
+    assert train.train(config, replace=True, **arguments).hash == load_agent(tmp_path).hash
     assert "policy_evaluation" not in load_agent(tmp_path).metadata
     # An agent that is behind the run is brought up to it.
-    ppo.train(config, state_only=True, **arguments | {"max_steps": 128})
-    assert ppo.train(config, **arguments | {"max_steps": 128}).metadata["steps"] == 128
+    train.train(config, state_only=True, **arguments | {"max_steps": 128})
+    assert train.train(config, **arguments | {"max_steps": 128}).metadata["steps"] == 128
 
 
 def test_a_run_keeps_its_engine(config, straight, tmp_path, monkeypatch):
     assert straight[1].phases[0]["engine"] == "native"
     monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
-    assert ppo.Trainer(config, straight[0]).env.engine == "native"
+    assert training_trainer.Trainer(config, straight[0]).env.engine == "native"
     with pytest.raises(ValueError, match="engine is 'mjx', but the run in .* with 'native'"):
-        ppo.Trainer(config, straight[0], "mjx")
+        training_trainer.Trainer(config, straight[0], "mjx")
     with pytest.raises(ValueError, match="engine is 'mjx'"):
-        ppo.anneal(config.name, folder=straight[0], engine="mjx")
-    assert ppo._engine(tmp_path, "mjx") == "mjx"
+        train.anneal(config.name, folder=straight[0], engine="mjx")
+    assert run_state._engine(tmp_path, "mjx") == "mjx"
     (tmp_path / "training.safetensors").touch()
     for phases, own in [("[{}]", "native"), ('[{"engine": "mjx"}, {}]', "mjx"), ("{", "auto")]:
         (tmp_path / "training.json").write_text(phases)
-        assert ppo._engine(tmp_path, "auto") == own
-    assert ppo._engine(tmp_path, "mjx") == "mjx"
+        assert run_state._engine(tmp_path, "auto") == own
+    assert run_state._engine(tmp_path, "mjx") == "mjx"
 
 
 def test_a_run_continues_only_with_its_own_configuration(config, tmp_path):
-    trainer = ppo.Trainer(config, tmp_path)
+    trainer = training_trainer.Trainer(config, tmp_path)
     trainer.start()
     trainer.run(max_steps=128, progress=False)
-    other = ppo.Trainer(replace(config, discount=0.9), tmp_path)
+    other = training_trainer.Trainer(replace(config, discount=0.9), tmp_path)
     with pytest.raises(ValueError, match="discount was 0.99, is 0.9"):
         other.start()
-    longer = ppo.Trainer(replace(config, epochs=1), tmp_path)
+    longer = training_trainer.Trainer(replace(config, epochs=1), tmp_path)
     assert longer.start()
     assert [phase["from_step"] for phase in longer.phases] == [0, 128]
     longer.save()
     # The run's own settings, whatever the defaults are now.
-    assert ppo.as_continued(replace(config, discount=0.9), tmp_path) == longer.config
-    assert ppo.as_continued(config, tmp_path / "nothing") == config
+    assert run_state.as_continued(replace(config, discount=0.9), tmp_path) == longer.config
+    assert run_state.as_continued(config, tmp_path / "nothing") == config
     other = replace(config, scale="full")
-    assert ppo.as_continued(other, tmp_path) == other
+    assert run_state.as_continued(other, tmp_path) == other
     scaled = replace(config, policy=replace(config.policy, latent_scale=3.0))
     with pytest.raises(ValueError, match=r"policy.latent_scale was 1.0, is 3.0.*as_continued"):
-        ppo.Trainer(scaled, tmp_path).start()
+        training_trainer.Trainer(scaled, tmp_path).start()
     quiet = replace(config, policy=replace(config.policy, std_limits=(0.05, 2.0)))
-    assert ppo.Trainer(quiet, tmp_path).start()  # the limits of the noise may change
+    assert training_trainer.Trainer(quiet, tmp_path).start()  # the limits of the noise may change
     shorter = replace(config, task=replace(config.task, horizon=6, curriculum_length=3))
-    brief = ppo.Trainer(shorter, tmp_path)
+    brief = training_trainer.Trainer(shorter, tmp_path)
     assert brief.start()
     before = np.asarray(brief.state.horizon)  # an episode that is under way keeps its length
     brief.run(max_steps=brief.steps + 2 * config.batch, progress=False)
@@ -315,13 +321,13 @@ def test_a_run_continues_only_with_its_own_configuration(config, tmp_path):
     (tmp_path / "training.json").write_text(json.dumps(longer.phases))
     rougher = replace(shorter, task=replace(shorter.task, push_probability=0.5))
     with pytest.raises(ValueError, match="task.push_probability was 0.002, is 0.5"):
-        ppo.Trainer(rougher, tmp_path).start()
+        training_trainer.Trainer(rougher, tmp_path).start()
     # The field is named even where the arrays have other shapes.
     wider = replace(config, policy=replace(config.policy, core_widths=(12, 8)))
     with pytest.raises(ValueError, match=r"core_widths was \[16, 8\], is \[12, 8\]"):
-        ppo.Trainer(wider, tmp_path).start()
+        training_trainer.Trainer(wider, tmp_path).start()
     with pytest.raises(ValueError, match="num_envs was 16, is 32"):
-        ppo.Trainer(replace(config, num_envs=32), tmp_path).start()
+        training_trainer.Trainer(replace(config, num_envs=32), tmp_path).start()
     # A run that is older than a setting goes on with the setting's default.
     for phase in longer.phases:
         del phase["config"]["task"]["design_radius"]
@@ -337,32 +343,34 @@ def test_a_run_continues_only_with_its_own_configuration(config, tmp_path):
     with pytest.raises(ValueError, match="training.json is missing or damaged"):
         longer.start()
     (tmp_path / "training.safetensors").rename(tmp_path / "gone")
-    assert ppo.as_continued(config, tmp_path) == config  # a new run, with today's settings
+    assert run_state.as_continued(config, tmp_path) == config  # a new run, with today's settings
 
 
 def test_the_default_configuration_continues_any_run(config, tmp_path, monkeypatch):
     other = replace(config, epochs=1, policy=replace(config.policy, latent_scale=3.0))
-    trainer = ppo.Trainer(other, tmp_path)
+    trainer = training_trainer.Trainer(other, tmp_path)
     trainer.start()
     trainer.run(max_steps=config.batch, progress=False)
-    default = ppo.TrainConfig.smoke(config.robots[0], name=config.name)
-    monkeypatch.setattr(ppo.TrainConfig, "at_scale", lambda *given, **changes: default)
+    default = training_config.TrainConfig.smoke(config.robots[0], name=config.name)
+    monkeypatch.setattr(training_config.TrainConfig, "at_scale", lambda *given, **changes: default)
     asked = []
-    monkeypatch.setattr(ppo.Trainer, "run", lambda self, *given: asked.append(self.config))
-    ppo.train(default, tmp_path, progress=False, state_only=True)
+    monkeypatch.setattr(
+        training_trainer.Trainer, "run", lambda self, *given: asked.append(self.config)
+    )
+    train.train(default, tmp_path, progress=False, state_only=True)
     assert asked == [other]
     with pytest.raises(ValueError, match="another configuration"):  # what is asked for is meant
-        ppo.train(replace(config, discount=0.9), tmp_path, progress=False, state_only=True)
+        train.train(replace(config, discount=0.9), tmp_path, progress=False, state_only=True)
 
 
-@pytest.mark.parametrize("call", [ppo.train, ppo.TrainConfig.reduced])
+@pytest.mark.parametrize("call", [train.train, training_config.TrainConfig.reduced])
 def test_what_is_no_configuration_and_no_robot(call):
     with pytest.raises(TypeError, match="expected a"):
         call(SimpleNamespace(name="go2"))
 
 
 def test_two_runs_in_one_folder(config, tmp_path):
-    trainer = ppo.Trainer(config, tmp_path)
+    trainer = training_trainer.Trainer(config, tmp_path)
     trainer.start()
     with alone_in(tmp_path), pytest.raises(ValueError, match="another training run is at work in"):
         trainer.run(max_steps=config.batch, progress=False)
@@ -374,24 +382,24 @@ def test_two_runs_in_one_folder(config, tmp_path):
 def test_annealing_leaves_the_run_as_it_is(config, tmp_path, monkeypatch):
     config = replace(config, num_envs=8, minibatch_size=32, epochs=1, name="walker")
     with pytest.raises(ValueError, match="training.safetensors is missing"):
-        ppo.anneal("walker", folder=tmp_path)
-    trainer = ppo.Trainer(config, tmp_path)
+        train.anneal("walker", folder=tmp_path)
+    trainer = training_trainer.Trainer(config, tmp_path)
     trainer.start()
     trainer.run(max_steps=2 * config.batch, progress=False)
-    before = {file: (tmp_path / file).read_bytes() for file in ppo.STATE_FILES}
+    before = {file: (tmp_path / file).read_bytes() for file in run_state.STATE_FILES}
     rate = np.interp(2 / config.iterations, [0, 1], config.learning_rate)
 
     steps, last_rate = 3 * config.batch, 1e-6
     # A time limit stops it early; the same call goes on with what is left.
     arguments = dict(steps=steps, last_rate=last_rate, folder=tmp_path, progress=False)
-    assert ppo.anneal("walker", max_seconds=0.0, **arguments) is None
+    assert train.anneal("walker", max_seconds=0.0, **arguments) is None
     with pytest.raises(ValueError, match="delete that folder to begin anew"):
-        ppo.anneal("walker", **arguments | {"steps": 2 * config.batch})
+        train.anneal("walker", **arguments | {"steps": 2 * config.batch})
     assert not (tmp_path / "agent.json").exists()
-    agent = ppo.anneal("walker", **arguments)
+    agent = train.anneal("walker", **arguments)
     assert agent.metadata["steps"] == 5 * config.batch
     assert load_agent(tmp_path).hash == agent.hash
-    assert {file: (tmp_path / file).read_bytes() for file in ppo.STATE_FILES} == before
+    assert {file: (tmp_path / file).read_bytes() for file in run_state.STATE_FILES} == before
     assert not (tmp_path / "annealed").exists()
     phase = agent.metadata["phases"][-1]
     first, last = phase["config"]["learning_rate"]
@@ -400,26 +408,26 @@ def test_annealing_leaves_the_run_as_it_is(config, tmp_path, monkeypatch):
     rows = load_curve(tmp_path)
     assert rows["steps"][-1] == 5 * config.batch
     with pytest.raises(ValueError, match="agent .* has 320 steps, the run that would .* it 192"):
-        ppo.anneal("walker", **arguments | {"steps": config.batch})
+        train.anneal("walker", **arguments | {"steps": config.batch})
     with pytest.raises(ValueError, match="last_rate is 0.01, above the present rate"):
-        ppo.anneal("walker", **arguments | {"last_rate": 1e-2})
+        train.anneal("walker", **arguments | {"last_rate": 1e-2})
     for steps in (0, -5, 1.5):
         with pytest.raises(ValueError, match=f"steps is {steps}; expected an integer of at least"):
-            ppo.anneal("walker", **arguments | {"steps": steps})
+            train.anneal("walker", **arguments | {"steps": steps})
     document = json.loads((tmp_path / "agent.json").read_text())
     document["metadata"]["policy_evaluation"] = {}
     (tmp_path / "agent.json").write_text(json.dumps(document))
     with pytest.raises(ValueError, match="critic from policy evaluation"):
-        ppo.anneal("walker", **arguments | {"steps": 9 * config.batch})
+        train.anneal("walker", **arguments | {"steps": 9 * config.batch})
     assert not (tmp_path / "annealed").exists() and load_agent(tmp_path).hash == agent.hash
     arguments |= {"steps": 2 * config.batch, "replace": True}
-    assert ppo.anneal("walker", max_seconds=0.0, **arguments) is None
+    assert train.anneal("walker", max_seconds=0.0, **arguments) is None
     assert (tmp_path / "annealed" / "training.safetensors").exists()
 
 
 def test_environments_that_fill_no_minibatch_wait_for_another_epoch(config, tmp_path):
     config = replace(config, num_envs=10, minibatch_size=32, epochs=3)  # 4 environments in each
-    trainer = ppo.Trainer(config, tmp_path)
+    trainer = training_trainer.Trainer(config, tmp_path)
     trainer.start()
     trainer.run(max_steps=config.batch, progress=False)
     counts = optax.tree.get_all_with_path(trainer.learner.policy_optimizer, "count")
@@ -429,24 +437,27 @@ def test_environments_that_fill_no_minibatch_wait_for_another_epoch(config, tmp_
 def test_state_only_saves_no_agent(config, tmp_path):
     config = replace(config, num_envs=8, minibatch_size=32, epochs=1)
     arguments = dict(folder=tmp_path, progress=False, state_only=True)
-    assert ppo.train(config, max_steps=config.batch, **arguments) is None
+    assert train.train(config, max_steps=config.batch, **arguments) is None
     assert (tmp_path / "training.safetensors").exists() and not (tmp_path / "agent.json").exists()
 
 
 def test_configurations_read_back_from_json():
-    for config in (ppo.TrainConfig.full("unitree_go2"), ppo.TrainConfig.smoke("golem", seed=3)):
-        assert ppo._from_plain(ppo.TrainConfig, ppo._plain(config)) == config
+    for config in (
+        training_config.TrainConfig.full("unitree_go2"),
+        training_config.TrainConfig.smoke("golem", seed=3),
+    ):
+        assert from_plain(training_config.TrainConfig, plain(config)) == config
     endless = replace(config, kl_threshold=float("inf"))
-    text = json.dumps(ppo._plain(endless), allow_nan=False)  # as in the metadata of an agent
-    assert ppo._from_plain(ppo.TrainConfig, json.loads(text)) == endless
+    text = json.dumps(plain(endless), allow_nan=False)  # as in the metadata of an agent
+    assert from_plain(training_config.TrainConfig, json.loads(text)) == endless
 
 
 def test_names_of_agents():
-    assert ppo.TrainConfig.reduced("some/where/my_robot.xml").name == "my_robot"
-    several = ppo.TrainConfig.reduced("a", robots=("a", "b/c.xml"))
+    assert training_config.TrainConfig.reduced("some/where/my_robot.xml").name == "my_robot"
+    several = training_config.TrainConfig.reduced("a", robots=("a", "b/c.xml"))
     assert several.name == "a+c" and several.robots == ("a", "b/c.xml")
     with pytest.raises(ValueError, match="without separators"):
-        ppo.TrainConfig.reduced("a", name="b/c")
+        training_config.TrainConfig.reduced("a", name="b/c")
 
 
 def test_a_broken_minibatch_changes_nothing(straight):
@@ -465,7 +476,7 @@ def test_update_follows_the_advantage(straight):
     """Actions with positive advantage become more likely, and the critic fits its targets."""
     _, trainer = straight
     env, config = trainer.env, replace(trainer.config, epochs=8, entropy_coefficient=0.0)
-    update, start = ppo.make_update(config, trainer.policy, trainer.critic)
+    update, start = training_update.make_update(config, trainer.policy, trainer.critic)
     learner = start(trainer.learner.policy, trainer.learner.critic)
     state = env.reset(jax.random.PRNGKey(1), coefficient=0.0)
     state, trajectory = env.rollout(trainer.act, learner.policy, state, jax.random.PRNGKey(2), 8)
@@ -507,7 +518,7 @@ def test_advantages_end_where_the_command_changes(straight):
 
     def learn(trajectory, **changes):
         config = replace(trainer.config, epochs=1, entropy_coefficient=0.0, **changes)
-        update, start = ppo.make_update(config, trainer.policy, trainer.critic)
+        update, start = training_update.make_update(config, trainer.policy, trainer.critic)
         new, _ = update(start(learner.policy, learner.critic), trajectory, jax.random.PRNGKey(3))
         return [
             np.concatenate([np.ravel(x) for x in jax.tree.leaves(variables)])
@@ -535,7 +546,7 @@ def test_the_critic_has_a_lambda_of_its_own(straight):
 
     def learn(value_lambda, gae_lambda):
         config = replace(trainer.config, epochs=1, value_lambda=value_lambda, gae_lambda=gae_lambda)
-        update, start = ppo.make_update(config, trainer.policy, trainer.critic)
+        update, start = training_update.make_update(config, trainer.policy, trainer.critic)
         new, _ = update(start(learner.policy, learner.critic), trajectory, jax.random.PRNGKey(3))
         return [
             np.concatenate([np.ravel(x) for x in jax.tree.leaves(v)])
@@ -551,40 +562,42 @@ def test_the_critic_has_a_lambda_of_its_own(straight):
 
 
 def test_curve_has_a_row_per_interval(config, tmp_path, monkeypatch):
-    monkeypatch.setattr(ppo, "CURVE_INTERVAL", 2)
+    monkeypatch.setattr("shapebody.training.trainer.CURVE_INTERVAL", 2)
     for steps in (128 * 2, 128 * 5):
-        trainer = ppo.Trainer(config, tmp_path)
+        trainer = training_trainer.Trainer(config, tmp_path)
         trainer.start()
         trainer.run(max_steps=steps, progress=False)
     rows = (tmp_path / "training.csv").read_text().splitlines()
-    assert rows[0].split(",") == ppo.CURVE
+    assert rows[0].split(",") == progress.CURVE
     assert [int(row.split(",")[0]) for row in rows[1:]] == [256, 512, 640]
 
 
 def test_a_row_that_was_cut_off_leaves_the_curve(tmp_path):
     path = tmp_path / "training.csv"
-    cells = ["128", "1.5", "", *["0.25"] * (len(ppo.CURVE) - 3)]  # no episode has ended
-    header, first, last = (",".join(row) + "\n" for row in (ppo.CURVE, cells, ["256", *cells[1:]]))
+    cells = ["128", "1.5", "", *["0.25"] * (len(progress.CURVE) - 3)]  # no episode has ended
+    header, first, last = (
+        ",".join(row) + "\n" for row in (progress.CURVE, cells, ["256", *cells[1:]])
+    )
     # Within the steps, after some cells, within the last number, and with the next row behind it.
     for torn in ("2", "256,1.5,", last[:-2], last[:-1], "", last[:9] + last):
         path.write_text(header + first + torn)
-        ppo._Curve(path, steps=256)
+        progress._Curve(path, steps=256)
         assert path.read_text() == header + first, torn
     path.write_text(header + first + last)
-    ppo._Curve(path, steps=256)
+    progress._Curve(path, steps=256)
     assert path.read_text() == header + first + last
-    ppo._Curve(path, steps=128)
+    progress._Curve(path, steps=128)
     assert path.read_text() == header + first
 
 
 def test_train_and_policy_evaluation(config, tmp_path):
-    agent = ppo.train(config, tmp_path / "a", progress=False, max_steps=128)
+    agent = train.train(config, tmp_path / "a", progress=False, max_steps=128)
     loaded = load_agent(tmp_path / "a")
     curve = (tmp_path / "a" / "curve.csv").read_text()
     assert curve.splitlines()[-1].startswith("128,")
     assert curve == (tmp_path / "a" / "training.csv").read_text()
     # Training on does not touch the agent or its curve until the agent is saved.
-    trainer = ppo.Trainer(config, tmp_path / "a")
+    trainer = training_trainer.Trainer(config, tmp_path / "a")
     trainer.start()
     trainer.run(max_steps=256, progress=False)
     assert (tmp_path / "a" / "training.csv").read_text().splitlines()[-1].startswith("256,")
@@ -598,15 +611,15 @@ def test_train_and_policy_evaluation(config, tmp_path):
     # A phase that is stopped leaves the agent as it is; the same call goes on with it.
     arguments = dict(steps=256, folder=tmp_path / "b", progress=False)
     save_agent(loaded, tmp_path / "b")
-    assert ppo.train_critic(loaded, small, max_seconds=0.0, **arguments) is loaded
+    assert policy_evaluation.train_critic(loaded, small, max_seconds=0.0, **arguments) is loaded
     assert load_agent(tmp_path / "b").hash == loaded.hash
-    sharper = ppo.train_critic(loaded, small, **arguments)
+    sharper = policy_evaluation.train_critic(loaded, small, **arguments)
     assert len(list((tmp_path / "b").glob("critic_*"))) == 1
     assert load_agent(tmp_path / "b").hash == sharper.hash != loaded.hash
     assert sharper.policy_hash == loaded.policy_hash
-    again = ppo.train_critic(sharper, small, **arguments)
+    again = policy_evaluation.train_critic(sharper, small, **arguments)
     assert again.hash == sharper.hash
-    longer = ppo.train_critic(sharper, small, **arguments | {"steps": 384})
+    longer = policy_evaluation.train_critic(sharper, small, **arguments | {"steps": 384})
     assert longer.metadata["policy_evaluation"]["steps"] == 384
     for a, b in zip(jax.tree.leaves(agent.policy), jax.tree.leaves(sharper.policy), strict=True):
         np.testing.assert_array_equal(a, b)
@@ -623,7 +636,7 @@ def test_mean_actions_are_without_noise(config, tmp_path):
     """The first ones of a rollout do not depend on its random key."""
     config = replace(config, learn_policy=False)
     for mean_actions in (True, False):
-        trainer = ppo.Trainer(replace(config, mean_actions=mean_actions), tmp_path)
+        trainer = training_trainer.Trainer(replace(config, mean_actions=mean_actions), tmp_path)
         first = []
         for key in jax.random.split(trainer.key):
             state = trainer.env.reset(trainer.key, coefficient=1.0)
@@ -635,7 +648,7 @@ def test_mean_actions_are_without_noise(config, tmp_path):
 def test_the_time_left_is_that_of_the_call(capsys):
     def left(last, seconds):
         curve = SimpleNamespace(latest=dict(steps_per_second=100.0, coefficient=0.0))
-        ppo._Report(last, time.monotonic() + seconds + 0.5, True).show(4_000, curve)
+        progress._Report(last, time.monotonic() + seconds + 0.5, True).show(4_000, curve)
         return capsys.readouterr().out.split()[-2]
 
     assert left(64_000, float("inf")) == "10m00"
@@ -646,7 +659,7 @@ def test_the_time_left_is_that_of_the_call(capsys):
 @pytest.mark.slow
 def test_training_on_mjx_resumes(tmp_path):
     """The run that was stopped ends with the very weights of the uninterrupted one."""
-    config = ppo.TrainConfig.smoke("unitree_go2", num_envs=4, minibatch_size=32)
+    config = training_config.TrainConfig.smoke("unitree_go2", num_envs=4, minibatch_size=32)
     straight = begin(config, tmp_path / "straight", "mjx")
     straight.run(max_steps=96, progress=False)
     for steps in (32, 96):

@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 import tiny
 
-from shapebody.evaluation import EvaluationConfig, evaluate
-from shapebody.locomotion import TaskConfig
-from shapebody.locomotion.rewards import combine
-from shapebody.recording import record_episode
+from shapebody.evaluation.evaluate import EvaluationConfig, evaluate
+from shapebody.evaluation.recording import record_episode
+from shapebody.task.config import TaskConfig
+from shapebody.task.rewards import combine
 
 
 @pytest.fixture(scope="module", autouse=True)

@@ -7,8 +7,8 @@ import mujoco
 import numpy as np
 import pytest
 
-from shapebody.paths import data_dir
-from shapebody.robots import load_robot, robots
+from shapebody.files import data_dir
+from shapebody.robot.robot import load_robot, robots
 
 NAMES = ("golem", "mit_humanoid", "unitree_go2")
 

@@ -6,7 +6,6 @@ from shapebody import runtime
 
 
 def run(program, **environment):
-
     done = subprocess.run(
         [sys.executable, "-c", program],
         env={**os.environ, **environment},

@@ -10,15 +10,17 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from tiny import quick_compilation, tiny_agent, tiny_robot
 
-from shapebody.descriptions import describe
-from shapebody.design import DesignSpace
-from shapebody.evaluation import evaluate
-from shapebody.locomotion import Locomotion
-from shapebody.recording import record_episode
-from shapebody.search import Objective, VGDSConfig, search
-from shapebody.search import objective as objectives
-from shapebody.search.vgds import penalty_only, vgds
-from shapebody.studies import design_study
+from shapebody.design.descriptions import describe
+from shapebody.design.space import DesignSpace
+from shapebody.evaluation.evaluate import evaluate
+from shapebody.evaluation.recording import record_episode
+from shapebody.optimizers import objective as optimizers_objective
+from shapebody.optimizers import state_bank
+from shapebody.optimizers.objective import Objective
+from shapebody.optimizers.search import search
+from shapebody.optimizers.vgds import VGDSConfig, penalty_only, vgds
+from shapebody.reproduction.design_study import design_study
+from shapebody.task.env import Locomotion
 
 BATCH = dict(batch_size=8)
 """One size of minibatches for all searches here, so that few programs are compiled."""
@@ -200,10 +202,10 @@ def test_objective_is_the_mean_over_states_and_heads_minus_the_penalty(agent, ro
 def test_slices_of_the_bank_give_the_same_mean(agent, robot, starts, monkeypatch):
     objective = Objective.of(agent, robot)
     whole = np.asarray(objective(starts))
-    monkeypatch.setattr(objectives, "MAX_ROWS", 3 * 7)
-    objectives._mean_value.clear_cache()
+    monkeypatch.setattr(optimizers_objective, "MAX_ROWS", 3 * 7)
+    optimizers_objective._mean_value.clear_cache()
     np.testing.assert_allclose(objective(starts), whole, atol=1e-5)
-    objectives._mean_value.clear_cache()
+    optimizers_objective._mean_value.clear_cache()
 
 
 def test_gradient_against_finite_differences(agent, robot, space):
@@ -257,17 +259,17 @@ def test_values_that_are_not_finite_count_as_the_worst(agent, robot, starts):
 def test_bank_of_known_and_unknown_robots(robot, tmp_path):
     three, four = tiny_robot(tmp_path, 3), tiny_robot(tmp_path, 4)
     both = tiny_agent(robot, four)
-    states = objectives.bank(both, robot)
+    states = state_bank.bank(both, robot)
     np.testing.assert_array_equal(states.general, both.states.general[both.state_robots == 0])
     assert states.joints.shape == (24, 2, 4) and states.feet.shape == (24, 2, 3)
     # A robot of three legs can borrow from the one with four only.
-    borrowed = objectives.bank(both, three)
+    borrowed = state_bank.bank(both, three)
     np.testing.assert_array_equal(borrowed.general, both.states.general[both.state_robots == 1])
     assert borrowed.joints.shape == (24, 3, 4)
     with pytest.raises(ValueError, match="3 joints and 3 feet of robot 'legs_3'.*states="):
-        objectives.bank(tiny_agent(robot), three)
+        state_bank.bank(tiny_agent(robot), three)
     with pytest.raises(ValueError, match="no state bank.*states="):
-        objectives.bank(dataclasses.replace(both, states=None), three)
+        state_bank.bank(dataclasses.replace(both, states=None), three)
 
 
 # search

@@ -10,15 +10,21 @@ from PIL import Image
 from test_networks import published_layers, write_published
 from tiny import quick_compilation, tiny_agent, tiny_robot
 
-from shapebody import critics, experiments, paper, studies
-from shapebody.checkpoints import load_agent
-from shapebody.design import DesignSpace
-from shapebody.evaluation import EvaluationConfig, evaluate, paired_gain
-from shapebody.locomotion import TaskConfig
-from shapebody.paths import data_dir
-from shapebody.robots import load_robot
-from shapebody.search import METHODS, Objective, search
-from shapebody.studies import CONTROL, Run, design_study
+from shapebody.agent.store import load_agent
+from shapebody.design.space import DesignSpace
+from shapebody.evaluation.evaluate import EvaluationConfig, evaluate
+from shapebody.evaluation.statistics import paired_gain
+from shapebody.files import data_dir
+from shapebody.optimizers.objective import Objective
+from shapebody.optimizers.search import METHODS, search
+from shapebody.reproduction import critic_ablation, paper, value_studies
+from shapebody.reproduction import design_study as reproduction_design_study
+from shapebody.reproduction import gains as reproduction_gains
+from shapebody.reproduction import results as reproduction_results
+from shapebody.reproduction import scale as reproduction_scale
+from shapebody.reproduction.design_study import CONTROL, Run, design_study
+from shapebody.robot.robot import load_robot
+from shapebody.task.config import TaskConfig
 
 RUNS = (CONTROL, Run("vgds", 20.0), Run("cem"), Run("vgds", 100.0, "reference"))
 SETTING = dict(starts=2, episodes=3, horizon=12, iterations=2)
@@ -48,12 +54,19 @@ def agent(robot):
 
 
 def test_runs_are_the_papers():
-    lambdas = [run.trust_region for run in studies.TRUST_REGION_RUNS if run.method == "vgds"]
+    lambdas = [
+        run.trust_region
+        for run in reproduction_design_study.TRUST_REGION_RUNS
+        if run.method == "vgds"
+    ]
     assert lambdas == list(paper.LAMBDAS)
-    assert {run.method for run in studies.METHOD_RUNS} == set(METHODS)
-    assert {run.trust_region for run in studies.METHOD_RUNS} == {None, 100.0}
-    assert CONTROL in studies.METHOD_RUNS and CONTROL in studies.TRUST_REGION_RUNS
-    assert studies.installed((CONTROL, Run("cem"))) == (CONTROL, Run("cem"))
+    assert {run.method for run in reproduction_design_study.METHOD_RUNS} == set(METHODS)
+    assert {run.trust_region for run in reproduction_design_study.METHOD_RUNS} == {None, 100.0}
+    assert (
+        CONTROL in reproduction_design_study.METHOD_RUNS
+        and CONTROL in reproduction_design_study.TRUST_REGION_RUNS
+    )
+    assert reproduction_design_study.installed((CONTROL, Run("cem"))) == (CONTROL, Run("cem"))
 
 
 def test_records_are_what_search_and_evaluation_give(results, agent, robot):
@@ -92,13 +105,15 @@ def test_records_are_what_search_and_evaluation_give(results, agent, robot):
         assert record["curve_evaluations"] == [0, 1, 2]
         assert record["curve_objective"][-1] == pytest.approx(found.objective[i], abs=2e-4)
     # The same episodes for all designs.
-    rows = studies.gains(records)
-    own = studies.gain(rows, "vgds", "reference", 100.0)
+    rows = reproduction_gains.gains(records)
+    own = reproduction_gains.gain(rows, "vgds", "reference", 100.0)
     assert own["pairs"] == 3
-    assert studies.gain(rows, "cem", "penalty-only", 100.0)["pairs"] == 2
+    assert reproduction_gains.gain(rows, "cem", "penalty-only", 100.0)["pairs"] == 2
 
 
-@pytest.mark.skipif(not studies.installed((Run("bo"),)), reason="BoTorch is not installed")
+@pytest.mark.skipif(
+    not reproduction_design_study.installed((Run("bo"),)), reason="BoTorch is not installed"
+)
 def test_evaluations_along_the_curve_of_bo(results, agent, robot):
     """BO has scored its first points before its first iteration."""
     records = design_study(agent, robot, (Run("bo"),), **dict(SETTING, starts=1))["records"]
@@ -115,7 +130,7 @@ def test_what_is_stored_is_not_computed_again(results, agent, robot, monkeypatch
         searched.append(method)
         return search(method, *arguments, **options)
 
-    monkeypatch.setattr(studies, "search", spy)
+    monkeypatch.setattr(reproduction_design_study, "search", spy)
     second = design_study(agent, robot, RUNS[:3], **SETTING)
     assert searched == ["cem"]
     assert second["records"][:7] == first["records"]
@@ -162,7 +177,12 @@ def test_other_starts_have_their_own_file(results, agent, robot):
     for mine, one in zip(same, (other[0], *other[2:]), strict=True):
         assert (mine["method"], mine["trust_region"]) == (one["method"], one["trust_region"])
         assert mine["predicted_value"] == pytest.approx(one["predicted_value"], abs=1e-3)
-    assert studies.gain(studies.gains(other), "vgds", "penalty-only", 20.0)["pairs"] == 1
+    assert (
+        reproduction_gains.gain(reproduction_gains.gains(other), "vgds", "penalty-only", 20.0)[
+            "pairs"
+        ]
+        == 1
+    )
     with pytest.raises(ValueError, match="first_start is -1; expected an integer of at least 0"):
         design_study(agent, robot, runs, first_start=-1, **SETTING)
 
@@ -204,25 +224,34 @@ def test_gains_refuse_two_engines(results, agent, robot):
     records = design_study(agent, robot, RUNS[:1], **SETTING)["records"]
     records[-1]["engine"] = "mjx"
     with pytest.raises(ValueError, match="engines mjx, native"):
-        studies.gains(records)
+        reproduction_gains.gains(records)
 
 
 def test_available_runs_are_installed_or_stored(results, agent, robot, monkeypatch):
     runs = (CONTROL, Run("bo"), Run("vgds", 20.0))
     monkeypatch.setattr(
-        studies, "installed", lambda runs: tuple(run for run in runs if run.method != "bo")
+        reproduction_design_study,
+        "installed",
+        lambda runs: tuple(run for run in runs if run.method != "bo"),
     )
-    assert studies.available(agent, robot, runs, **SETTING) == (CONTROL, runs[2])
+    assert reproduction_design_study.available(agent, robot, runs, **SETTING) == (CONTROL, runs[2])
     monkeypatch.setattr(
-        studies, "search", lambda method, *rest, **options: search("random", *rest, **options)
+        reproduction_design_study,
+        "search",
+        lambda method, *rest, **options: search("random", *rest, **options),
     )
     design_study(agent, robot, runs[1:2], **SETTING)
-    assert studies.available(agent, robot, runs, **SETTING) == runs
-    assert studies.available(agent, robot, runs, **dict(SETTING, episodes=2)) == runs
+    assert reproduction_design_study.available(agent, robot, runs, **SETTING) == runs
+    assert (
+        reproduction_design_study.available(agent, robot, runs, **dict(SETTING, episodes=2)) == runs
+    )
     for other in (dict(SETTING, starts=3), dict(SETTING, recompute=True)):
-        assert studies.available(agent, robot, runs, **other) == (CONTROL, runs[2])
+        assert reproduction_design_study.available(agent, robot, runs, **other) == (
+            CONTROL,
+            runs[2],
+        )
     monkeypatch.setenv("SHAPEBODY_SCALE", "smoke")
-    assert studies.available(agent, robot, runs, **SETTING) == (CONTROL, runs[2])
+    assert reproduction_design_study.available(agent, robot, runs, **SETTING) == (CONTROL, runs[2])
 
 
 def interval(gain, digits=1):
@@ -238,7 +267,7 @@ def readme_rows(name):
     robot, agent = load_robot(name), load_agent(name)
 
     def stored(file):
-        study = experiments.stored_result(data_dir() / "results" / f"{file}_{name}.json")
+        study = reproduction_results.stored_result(data_dir() / "results" / f"{file}_{name}.json")
         assert study["provenance"]["agent"]["hash"] == agent.hash, f"{file}: another agent"
         return study["records"]
 
@@ -247,22 +276,24 @@ def readme_rows(name):
         return np.array([r["returns"] for r in found])
 
     records = stored("design_study")
-    others = experiments.stored_result(
+    others = reproduction_results.stored_result(
         data_dir() / "results" / f"design_study_{name}_starts_from_10.json"
     )["records"]
-    gains = {q: studies.gains(records, q) for q in ("return", "tracking_error", "length")}
+    gains = {
+        q: reproduction_gains.gains(records, q) for q in ("return", "tracking_error", "length")
+    }
     plain = [
         paired_gain(values, np.zeros_like(values))
         for values in (returns(records, "none", "reference")[0], returns(records, "none", "start"))
     ]
-    added = {q: studies.gain(gains[q], "vgds", "penalty-only", 100.0) for q in gains}
-    again = studies.gain(studies.gains(others), "vgds", "penalty-only", 100.0)
+    added = {q: reproduction_gains.gain(gains[q], "vgds", "penalty-only", 100.0) for q in gains}
+    again = reproduction_gains.gain(reproduction_gains.gains(others), "vgds", "penalty-only", 100.0)
     first = [
         robot.display_name,
         f"{agent.metadata['steps'] / 1e6:.1f} million",
         *(f"{one.mean:.1f} [{one.low:.1f}, {one.high:.1f}]" for one in plain),
         f"{paper.SINGLE_ROBOT[name]['VGDS']:+.1f}",
-        interval(numbers(studies.gain(gains["return"], "vgds", "start", 100.0))),
+        interval(numbers(reproduction_gains.gain(gains["return"], "vgds", "start", 100.0))),
         interval(numbers(added["return"])),
         interval(numbers(again)),
     ]
@@ -286,7 +317,7 @@ def test_readme_states_the_stored_results():
     """The tables of agents, row by row, from data/results, and the sentences that go with them."""
     readme = (Path(__file__).parents[1] / "README.md").read_text()
     text = " ".join(readme.split())
-    added, parts, names = {}, {}, experiments.trained_robots(paper.ROBOTS)
+    added, parts, names = {}, {}, reproduction_scale.trained_robots(paper.ROBOTS)
     for name in names:
         first, second, episodes, added[name], parts[name] = readme_rows(name)
         for row in (first, second):
@@ -308,8 +339,8 @@ def test_readme_states_the_stored_results():
     assert "at λ = 0, VGDS makes the MIT Humanoid and the Golem worse than the penalty" in text
     for name in ("mit_humanoid", "golem"):
         path = data_dir() / "results" / f"design_study_{name}.json"
-        rows = studies.gains(experiments.stored_result(path)["records"])
-        assert studies.gain(rows, "vgds", "penalty-only", 0.0)["high"] < 0
+        rows = reproduction_gains.gains(reproduction_results.stored_result(path)["records"])
+        assert reproduction_gains.gain(rows, "vgds", "penalty-only", 0.0)["high"] < 0
 
 
 def test_readme_states_the_example_and_the_mean():
@@ -317,7 +348,7 @@ def test_readme_states_the_example_and_the_mean():
     text = " ".join((Path(__file__).parents[1] / "README.md").read_text().split())
     path = data_dir() / "results" / "design_study_unitree_go2.json"
     found = {}
-    for record in experiments.stored_result(path)["records"]:
+    for record in reproduction_results.stored_result(path)["records"]:
         if record["origin"] == "start" and record["trust_region"] in (None, 100.0):
             found.setdefault(record["method"], {})[record["start"]] = record["return"]
     one = [found[method][3] for method in ("none", "vgds", "penalty-only")]
@@ -335,8 +366,8 @@ def test_what_notebook_04_says_of_the_two_critics():
     rows, difference = {}, {}
     for name in ("unitree_go2", "mit_humanoid"):
         file = data_dir() / "results" / f"critic_tasks_{name}.json"
-        found = [r for r in experiments.stored_result(file)["records"] if "returns" in r]
-        for row in critics.critic_gains(found):
+        found = [r for r in reproduction_results.stored_result(file)["records"] if "returns" in r]
+        for row in critic_ablation.critic_gains(found):
             rows[name, row["critic"], row["trust_region"]] = row
         for value in (20.0, 100.0):
             newer, older = (
@@ -365,10 +396,12 @@ def test_what_notebook_02_says_of_the_authors_policies():
     gains, reference = {}, {}
     for name in paper.ROBOTS:
         path = data_dir() / "results" / f"published_policy_{name}.json"
-        first, *starts = experiments.stored_result(path)["records"]
+        first, *starts = reproduction_results.stored_result(path)["records"]
         starts = np.array([record["returns"] for record in starts])
         gains[name] = paired_gain(np.broadcast_to(first["returns"], starts.shape), starts)
-        own = experiments.stored_result(data_dir() / "results" / f"design_study_{name}.json")
+        own = reproduction_results.stored_result(
+            data_dir() / "results" / f"design_study_{name}.json"
+        )
         mine = [r for r in own["records"] if (r["origin"], r["method"]) == ("reference", "none")]
         reference[name] = mine[0]["return"] - first["return"]
     printed = {name: paper.SINGLE_ROBOT[name]["f_ref"] for name in paper.ROBOTS}
@@ -389,7 +422,7 @@ def test_stored_results_belong_to_the_shipped_agents():
             if source:
                 assert source["hash"] == load_agent(source["name"]).hash, path.name
                 seen.add(path.name)
-    assert len(seen) >= 3 * len(experiments.trained_robots(paper.ROBOTS))
+    assert len(seen) >= 3 * len(reproduction_scale.trained_robots(paper.ROBOTS))
     with Image.open(folder / "before_after.png") as picture:
         source = json.loads(picture.text["provenance"])
     assert source["agent"]["hash"] == load_agent("unitree_go2").hash
@@ -404,15 +437,19 @@ def test_stored_studies_are_whole(name, episodes):
     Bayesian optimization with the MIT Humanoid's critic is still to be computed (TRAINING.md).
     """
     robot, agent = load_robot(name), load_agent(name)
-    runs = (*studies.METHOD_RUNS, *studies.TRUST_REGION_RUNS)
+    runs = (*reproduction_design_study.METHOD_RUNS, *reproduction_design_study.TRUST_REGION_RUNS)
     if name == "mit_humanoid":
         runs = tuple(run for run in runs if run.method != "bo")
     setting = dict(starts=10, episodes=episodes, horizon=1000)
-    assert studies.available(agent, robot, runs, **setting) == runs
-    stored = experiments.stored_parts(
-        f"design_study_{name}", agent, studies._searches(runs, {}), **setting, seed=0
+    assert reproduction_design_study.available(agent, robot, runs, **setting) == runs
+    stored = reproduction_results.stored_parts(
+        f"design_study_{name}",
+        agent,
+        reproduction_design_study._searches(runs, {}),
+        **setting,
+        seed=0,
     )
-    assert {studies._part(run) for run in runs} <= set(stored)
+    assert {reproduction_design_study._part(run) for run in runs} <= set(stored)
 
 
 def test_size_share_takes_the_found_designs_apart(agent, robot, monkeypatch):
@@ -423,8 +460,8 @@ def test_size_share_takes_the_found_designs_apart(agent, robot, monkeypatch):
         walked.append(designs)
         return evaluate(agent, robot, designs, **rest)
 
-    monkeypatch.setattr(studies, "evaluate", seen)
-    records = studies.size_share(agent, robot, **setting)
+    monkeypatch.setattr(reproduction_design_study, "evaluate", seen)
+    records = value_studies.size_share(agent, robot, **setting)
     kinds = ("all", "size only", "all but size")
     expected = [("reference", None), *((kind, i) for kind in kinds for i in range(2))]
     assert [(r["kept"], r["start"]) for r in records] == expected
@@ -445,9 +482,9 @@ def test_size_share_takes_the_found_designs_apart(agent, robot, monkeypatch):
 
 def test_published_policy(results, agent, robot, tmp_path, monkeypatch):
     with pytest.raises(FileNotFoundError, match="folder of the authors' weights"):
-        studies.published_policy(robot, agent)
+        value_studies.published_policy(robot, agent)
     write_published(tmp_path, published_layers(), robot.name)
-    study = studies.published_policy(robot, agent, tmp_path, starts=1, episodes=2)
+    study = value_studies.published_policy(robot, agent, tmp_path, starts=1, episodes=2)
     assert [(r["origin"], r["start"]) for r in study["records"]] == [
         ("reference", None),
         ("start", 0),
@@ -455,4 +492,4 @@ def test_published_policy(results, agent, robot, tmp_path, monkeypatch):
     assert all(len(r["returns"]) == 2 for r in study["records"])
     for scale in ("reduced", "full", "smoke"):
         monkeypatch.setenv("SHAPEBODY_SCALE", scale)
-        assert studies.published_policy(robot, agent) == study
+        assert value_studies.published_policy(robot, agent) == study

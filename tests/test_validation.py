@@ -9,8 +9,9 @@ from test_robots import BAD, OWN, RIGHT_ACTUATOR, own_robot
 
 import shapebody as sb
 from shapebody.__main__ import main
-from shapebody.robots import load_robot
-from shapebody.validation import hold, validate_robot
+from shapebody.robot.report import validate_robot
+from shapebody.robot.robot import load_robot
+from shapebody.robot.standing import hold
 
 
 @pytest.fixture
@@ -145,7 +146,7 @@ def test_faults_of_the_package_are_reported_too(tmp_path, monkeypatch):
     def fails(path):
         raise IndexError("list index out of range")
 
-    monkeypatch.setattr("shapebody.validation.examine", fails)
+    monkeypatch.setattr("shapebody.robot.report.examine", fails)
     (problem,) = validate_robot(own_robot(tmp_path)).problems
     assert "a fault of shapebody" in problem and "IndexError: list index" in problem
 

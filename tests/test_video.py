@@ -9,7 +9,7 @@ import pytest
 from PIL import Image
 from walker import WALKER
 
-from shapebody import video
+from shapebody.show import opengl, render, video
 
 
 @pytest.fixture(scope="module")
@@ -22,14 +22,14 @@ def backend(request, monkeypatch):
     """Each test once as this machine renders, once with OpenGL forbidden."""
     if request.param == "drawn":
         monkeypatch.setenv("MUJOCO_GL", "off")
-        video.find_opengl.cache_clear()
+        opengl.find_opengl.cache_clear()
         yield None
         monkeypatch.undo()
-        video.find_opengl.cache_clear()
+        opengl.find_opengl.cache_clear()
     else:
-        if video.find_opengl() is None:
+        if opengl.find_opengl() is None:
             pytest.skip("no OpenGL on this machine")
-        yield video.find_opengl()
+        yield opengl.find_opengl()
 
 
 def redness(pictures):
@@ -38,14 +38,14 @@ def redness(pictures):
 
 
 def test_frame_shows_the_robot(model, backend):
-    picture = video.render_frame(model, height=120, width=160)
+    picture = render.render_frame(model, height=120, width=160)
     assert picture.shape == (120, 160, 3) and picture.dtype == np.uint8
     assert redness(picture).mean() > 0.02
 
 
 def test_collision_spheres_are_hidden(model, backend):
     def share_of_green(**options):
-        picture = video.render_frame(model, height=120, width=160, distance=2.0, **options)
+        picture = render.render_frame(model, height=120, width=160, distance=2.0, **options)
         return ((picture[..., 1] > 90) & (picture[..., 0] < 60)).mean()
 
     assert share_of_green() == 0
@@ -62,38 +62,38 @@ def test_rollout_has_the_right_number_of_frames(model, backend):
 
 def test_pictures_leave_the_model_alone(model, backend):
     before = model.vis.quality.offsamples, model.vis.global_.offheight
-    video.render_frame(model, height=800, width=900)
+    render.render_frame(model, height=800, width=900)
     assert (model.vis.quality.offsamples, model.vis.global_.offheight) == before
 
 
 def test_body_grid(model, backend):
-    grid = video.body_grid([model] * 3, labels=list("abc"), columns=2, height=60, width=80)
+    grid = render.body_grid([model] * 3, labels=list("abc"), columns=2, height=60, width=80)
     assert grid.shape == (2 * (60 + 26), 160, 3)
 
 
 def test_drawing_says_once_how_to_get_opengl(model, monkeypatch, capsys):
     monkeypatch.setattr(video, "find_opengl", lambda: None)
-    video._say.cache_clear()
-    video.render_frame(model, height=40, width=40)
-    video.render_frame(model, height=40, width=40)
+    opengl._say.cache_clear()
+    render.render_frame(model, height=40, width=40)
+    render.render_frame(model, height=40, width=40)
     said = capsys.readouterr().out
     assert said.count("\n") == 1 and "apt-get install libegl1" in said
 
 
 def test_opengl_that_fails_late_is_replaced_by_drawing(model, monkeypatch, capsys):
     monkeypatch.setattr(video, "find_opengl", lambda: "no_such_interface")
-    assert video.render_frame(model, height=40, width=40).shape == (40, 40, 3)
+    assert render.render_frame(model, height=40, width=40).shape == (40, 40, 3)
     assert "no_such_interface" in capsys.readouterr().out
 
 
 def test_opengl_is_found_after_mujoco_was_imported():
-    if video.find_opengl() is None:
+    if opengl.find_opengl() is None:
         pytest.skip("no OpenGL on this machine")
     program = (
         "import mujoco; from shapebody import video; "
         "model = mujoco.MjModel.from_xml_string('<mujoco><worldbody><body><freejoint/>"
         '<geom size=".1"/></body></worldbody></mujoco>\'); '
-        "print(video.render_frame(model, height=32, width=32).shape)"
+        "print(render.render_frame(model, height=32, width=32).shape)"
     )
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
     assert done.stdout.strip() == "(32, 32, 3)" and done.stderr == ""
@@ -101,14 +101,14 @@ def test_opengl_is_found_after_mujoco_was_imported():
 
 def test_standing_pose_touches_the_floor(model):
     # Foot centre 0.3 below the trunk, radius 0.04.
-    assert video.standing_pose(model)[2] == pytest.approx(0.34)
+    assert render.standing_pose(model)[2] == pytest.approx(0.34)
 
 
 def test_standing_pose_is_the_home_keyframe():
     def knee(keys):
         keys = "".join(f"<key {name} qpos='0 0 1 1 0 0 0 {angle}'/>" for name, angle in keys)
         text = WALKER.replace("</mujoco>", f"<keyframe>{keys}</keyframe></mujoco>")
-        return video.standing_pose(mujoco.MjModel.from_xml_string(text))[7]
+        return render.standing_pose(mujoco.MjModel.from_xml_string(text))[7]
 
     assert knee([("name='crouch'", 0.9), ("name='home'", 0.2)]) == 0.2
     assert knee([("name='crouch'", 0.9), ("", 0.2)]) == 0.9
@@ -132,8 +132,8 @@ def test_video_without_ffmpeg_is_a_gif(monkeypatch, tmp_path, capsys):
         raise RuntimeError("no ffmpeg")
 
     monkeypatch.setattr(imageio_ffmpeg, "get_ffmpeg_exe", missing)
-    monkeypatch.setattr(video.shutil, "which", lambda name: None)
-    video._say.cache_clear()
+    monkeypatch.setattr(opengl.shutil, "which", lambda name: None)
+    opengl._say.cache_clear()
     kind, data = video.encode_video(clip())
     assert kind == "image/gif" and data[:3] == b"GIF"
     page = video.video_html(clip())
@@ -159,14 +159,14 @@ def test_film_strip():
 @pytest.mark.parametrize(
     "call, message",
     [
-        (lambda m: video.render_frame(m, np.zeros(3)), r"shape \[3\], expected \[8\]"),
+        (lambda m: render.render_frame(m, np.zeros(3)), r"shape \[3\], expected \[8\]"),
         (lambda m: video.render_rollout(m, np.zeros(8)), r"expected \[T, 8\]"),
         (lambda m: video.render_rollout(m, np.zeros((0, 8))), "no rows"),
         (lambda m: video.render_rollout(m, np.full((2, 8), np.nan)), "not finite"),
         (lambda m: video.side_by_side(clip(), clip(height=20)), "one height"),
         (lambda m: video.side_by_side(clip(), labels=["a", "b"]), "2 labels for 1"),
         (lambda m: video.encode_video(np.zeros((3, 4, 4, 3))), "expected uint8"),
-        (lambda m: video.body_grid([]), "at least one"),
+        (lambda m: render.body_grid([]), "at least one"),
     ],
 )
 def test_wrong_input_is_named(model, call, message):
@@ -176,7 +176,7 @@ def test_wrong_input_is_named(model, call, message):
 
 def test_something_without_a_model_is_refused():
     with pytest.raises(TypeError, match="to_model"):
-        video.render_frame(np.zeros(3))
+        render.render_frame(np.zeros(3))
 
 
 def test_fewer_colours_take_fewer_bytes(monkeypatch):

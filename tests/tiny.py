@@ -5,11 +5,14 @@ import contextlib
 import jax
 import numpy as np
 
-from shapebody.checkpoints import Agent
-from shapebody.descriptions import Sizes
-from shapebody.locomotion import Observation
-from shapebody.networks import Critic, CriticConfig, Policy, PolicyConfig, initialize
-from shapebody.robots import load_robot
+from shapebody.agent.agent import Agent
+from shapebody.design.descriptions import Sizes
+from shapebody.networks.config import CriticConfig, PolicyConfig
+from shapebody.networks.critic import Critic
+from shapebody.networks.inputs import initialize
+from shapebody.networks.policy import Policy
+from shapebody.robot.robot import load_robot
+from shapebody.task.observations import Observation
 
 LEG = """
       <body name="leg_{i}" pos="{x} {y} 0">

@@ -19,7 +19,7 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
-from shapebody.checks import (
+from shapebody.arguments import (
     require_array,
     require_choice,
     require_integer,
@@ -27,15 +27,21 @@ from shapebody.checks import (
     require_shape,
     single,
 )
-from shapebody.design import MODEL_FIELDS, Embodiment
-from shapebody.physics import MAX_VALUE, MOST_SIMULATIONS, MOST_SUBSTEPS, home_sensordata, prepare
+from shapebody.design.phi import MODEL_FIELDS, Embodiment
+from shapebody.physics.protocol import (
+    MAX_VALUE,
+    MOST_SIMULATIONS,
+    MOST_SUBSTEPS,
+    home_sensordata,
+    prepare,
+)
 
 with contextlib.redirect_stdout(io.StringIO()):  # It prints that the optional Warp is missing.
     from mujoco import mjx
     from mujoco.mjx._src import collision_driver, math
 
 if TYPE_CHECKING:
-    from shapebody.robots import Robot
+    from shapebody.robot.robot import Robot
 
 # MJX decides once, for all designs, which joints have dry friction, and its solver locks such a
 # joint in a design whose friction is zero. So all hinges have some, far below what matters.
@@ -187,7 +193,7 @@ class MjxPhysics:
 
         Returns:
           (state, qpos (N, nq), qvel (N, nv), sensordata (N, nsensordata), finite (N,) bool), the
-          last four as in `shapebody.physics.Readings`.
+          last four as in `shapebody.physics.protocol.Readings`.
 
         Raises:
           ValueError: ctrl of another shape.

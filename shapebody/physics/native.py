@@ -12,14 +12,9 @@ import mujoco
 import numpy as np
 from mujoco.batch import Batch, SimulationError
 
-from shapebody.checks import (
-    require_array,
-    require_flag,
-    require_integer,
-    require_kind,
-)
-from shapebody.design import MODEL_FIELDS, Embodiment
-from shapebody.physics import (
+from shapebody.arguments import require_array, require_flag, require_integer, require_kind
+from shapebody.design.phi import MODEL_FIELDS, Embodiment
+from shapebody.physics.protocol import (
     MAX_VALUE,
     MOST_SIMULATIONS,
     MOST_SUBSTEPS,
@@ -29,7 +24,7 @@ from shapebody.physics import (
 )
 
 if TYPE_CHECKING:
-    from shapebody.robots import Robot
+    from shapebody.robot.robot import Robot
 
 # In place of each of these, MuJoCo would reset the simulation or, for the last, drop the control.
 _FATAL_WARNINGS = slice(

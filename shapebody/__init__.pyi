@@ -1,0 +1,29 @@
+"""The public interface; `__init__.py` imports each name from here on its first use."""
+
+from . import analysis as analysis
+from . import reproduction as reproduction
+from .agent.store import load_agent as load_agent
+from .agent.store import save_agent as save_agent
+from .design.descriptions import describe as describe
+from .design.phi import phi as phi
+from .design.space import DesignSpace as DesignSpace
+from .evaluation.evaluate import EvaluationConfig as EvaluationConfig
+from .evaluation.evaluate import evaluate as evaluate
+from .evaluation.recording import record_episode as record_episode
+from .evaluation.statistics import paired_gain as paired_gain
+from .networks.config import CriticConfig as CriticConfig
+from .networks.config import PolicyConfig as PolicyConfig
+from .optimizers.objective import Objective as Objective
+from .optimizers.search import METHODS as METHODS
+from .optimizers.search import search as search
+from .optimizers.vgds import VGDSConfig as VGDSConfig
+from .reproduction.scale import scale as scale
+from .robot.report import validate_robot as validate_robot
+from .robot.robot import load_robot as load_robot
+from .robot.robot import robots as robots
+from .runtime import start_notebook as start_notebook
+from .show import plots as plots
+from .show import video as video
+from .task.config import TaskConfig as TaskConfig
+from .training.config import TrainConfig as TrainConfig
+from .training.train import train as train

@@ -1,0 +1,91 @@
+"""Differential evolution (Appendix C)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from shapebody.optimizers.loop import (
+    Search,
+    Steps,
+    initial_population,
+    iterate,
+    require,
+    require_integers,
+    require_std,
+)
+
+
+@dataclass(frozen=True)
+class DEConfig:
+    """Settings of differential evolution; the defaults are the paper's."""
+
+    iterations: int = 50
+    particles: int = 32
+    weight: float = 0.5
+    """Differential weight F."""
+    crossover: float = 0.9
+    """CR, probability that a parameter comes from the mutant."""
+    initial_std: float | None = None
+    """Standard deviation of the initial particles around the start; uniform in the box if None."""
+
+    def __post_init__(self):
+        require_integers(self, "iterations")
+        require_integers(self, "particles", least=4)
+        require(self, "a number from 0 to 2", lambda x: 0 <= x <= 2, "weight")
+        require(self, "a probability", lambda x: 0 <= x <= 1, "crossover")
+        require_std(self)
+
+
+class _Population(NamedTuple):
+    design: jax.Array  # [d] best design of the population
+    particles: jax.Array  # [P, d]
+    values: jax.Array  # [P]
+    iteration: jax.Array  # []
+
+
+def de(objective, starts, key, config: DEConfig) -> Search:
+    """Differential evolution (rand/1/bin); returns the best design of the population.
+
+    For every particle, the mutant a + F (b - c) of three other particles is crossed with it, and
+    the clipped trial takes its place if it is better.
+    """
+    evaluations = config.iterations * config.particles
+    return iterate(objective, starts, key, config, _DE, evaluations)
+
+
+def _de_begin(config, start, key):
+    particles = initial_population(config, start, key)
+    return _Population(start, particles, jnp.full(config.particles, -jnp.inf), jnp.int32(0))
+
+
+def _de_propose(config, memory, key):
+    count, size = memory.particles.shape
+
+    def trial(index, particle, key):
+        others_key, cross_key, forced_key = jax.random.split(key, 3)
+        others = jax.random.choice(others_key, count - 1, (3,), replace=False)
+        a, b, c = memory.particles[others + (others >= index)]
+        crossed = jax.random.uniform(cross_key, (size,)) < config.crossover
+        # At least one parameter comes from the mutant.
+        crossed = crossed.at[jax.random.randint(forced_key, (), 0, size)].set(True)
+        return jnp.where(crossed, jnp.clip(a + config.weight * (b - c), -1.0, 1.0), particle)
+
+    keys = jax.random.split(key, count)
+    trials = jax.vmap(trial)(jnp.arange(count), memory.particles, keys)
+    return jnp.where(memory.iteration == 0, memory.particles, trials)
+
+
+def _de_update(config, memory, scored, key):
+    better = scored.values > memory.values
+    particles = jnp.where(better[:, None], scored.designs, memory.particles)
+    values = jnp.maximum(scored.values, memory.values)
+    best = jnp.argmax(values)
+    design = jnp.where(values[best] > -jnp.inf, particles[best], memory.design)
+    return _Population(design, particles, values, memory.iteration + 1)
+
+
+_DE = Steps(_de_begin, _de_propose, _de_update)

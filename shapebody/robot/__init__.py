@@ -1,0 +1,1 @@
+"""A robot: its file read, completed, checked and described."""

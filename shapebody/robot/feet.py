@@ -1,0 +1,155 @@
+"""Feet of a robot file that names none, and the height at which they touch the floor."""
+
+from collections.abc import Iterator
+
+import mujoco
+import numpy as np
+
+from shapebody.robot.foot_shapes import FOOT_SHAPES, add_foot, is_tall, shape_name
+from shapebody.robot.geometry import lowest, lowest_geoms, standing_height
+from shapebody.robot.leg_ends import (
+    colliding,
+    foot_ids,
+    foot_name,
+    idle_tails,
+    leg_ends,
+    sole_beside,
+    solid,
+)
+from shapebody.robot.spec_edits import FOOT, each, listed, rename_geom, unused, write_inertial
+
+_GEOM = mujoco.mjtGeom
+
+
+FLOOR_TOLERANCE = 0.05  # of the home height: how far feet may be from the floor
+
+
+def infer_feet(spec, model) -> Iterator[str]:
+    """One sphere or box per foot, with "foot" in its name and nothing else so named.
+
+    Named geoms of other shapes are replaced by the sphere or box that bounds them, and named
+    geoms that touch nothing by the colliding sole of the same leg, if it is as low. Without names,
+    feet are the lowest geoms of the legs: of the outermost moving bodies that reach the floor in
+    the home pose. Of geoms as tall as a shank the foot is the lower end.
+    """
+    geoms = {geom.id: geom for geom in spec.geoms}
+    named: dict[int, list[int]] = {}
+    for index, geom in geoms.items():
+        if FOOT.search(geom.name) and geom.parent.name != "world":
+            named.setdefault(int(model.geom_bodyid[index]), []).append(index)
+    data = _home_data(model)
+    tails, marked = [], []
+    if named:
+        groups, labels, marked = _named_feet(model, data, geoms, named)
+    else:
+        groups, tails = list(leg_ends(model, data.qpos).values()), idle_tails(model, data.qpos)
+        labels = {group[0]: foot_name(geoms, group) for group in groups}
+    own_names = {group[0] for group in named.values() if len(group) == 1}
+    ready = {
+        group[0]
+        for group in groups
+        if len(group) == 1
+        and model.geom_type[group[0]] in FOOT_SHAPES
+        and not geoms[group[0]].meshname
+        and (group[0] in own_names or not is_tall(model, data, group))
+    }
+    if named and ready == own_names and len(ready) == len(named):
+        return
+    # A mesh that is only for looks must not count as a foot.
+    for group in named.values():
+        for index in group:
+            names = {geom.name for geom in spec.geoms}
+            rename_geom(spec, geoms[index], unused(FOOT.sub("sole", geoms[index].name), names))
+    made = []
+    for group in groups:
+        geom = geoms[group[0]]
+        body = geom.parent
+        # The inertia of the body must not follow its new foot.
+        if not body.explicitinertial:
+            write_inertial(body, model)
+        was = shape_name(model, group)
+        if group[0] not in ready:
+            if is_tall(model, data, group):
+                was = f"the lower end of {was}"
+            geom = add_foot(spec, geoms, model, data, group)
+        rename_geom(spec, geom, unused(labels[group[0]], {other.name for other in spec.geoms}))
+        shape = "sphere" if geom.type == _GEOM.mjGEOM_SPHERE else "box"
+        made.append(f"{geom.name!r} (body {body.name!r}, {was}, now a {shape})")
+    if not made:
+        return
+    if marked:
+        yield (
+            f"geoms {listed(marked)} touch nothing, and beside them other geoms of the same legs "
+            f'do: these are the feet: {", ".join(made)}; to say it yourself put "foot" into the '
+            "names of the geoms that touch the floor alone"
+        )
+    elif named:
+        yield (
+            f"feet must be one sphere or box each: {', '.join(made)}; to say it yourself replace "
+            "the geoms"
+        )
+    else:
+        yield (
+            'no geom has "foot" in its name: the lowest geoms of the legs are the feet: '
+            f"{', '.join(made)}; to say it yourself name the geoms that touch the floor, "
+            'e.g. name="left_foot"'
+        )
+    if tails:
+        yield (
+            f"{each('body', [model.body(body).name for body in tails])} reaches the floor too, but "
+            "is not like the legs, and the robot stands without it: it is a tail that bears no "
+            'weight, and passes through the floor; to make it a foot put "foot" into the names of '
+            "all geoms that touch the floor"
+        )
+
+
+def _named_feet(model, data, geoms, named):
+    """Groups of geoms that are feet, the names of the feet by the first geom of a group, and the
+    names of geoms that are no feet; `named` are the ids of named geoms by their bodies."""
+    groups: dict[int, list[int]] = {}
+    labels, marked = {}, []
+    height = standing_height(model, data)
+    for body, group in named.items():
+        touching = colliding(model, group)
+        level = data.geom_xpos[group, 2].min()
+        sole = [] if touching else sole_beside(model, data, body, level)
+        if sole:
+            marked += [geoms[index].name for index in group]
+        found = sole or lowest_geoms(model, data, solid(model, touching or group), height)
+        # Two names for one sole are one foot.
+        groups.setdefault(found[0], found)
+        labels.setdefault(found[0], foot_name(geoms, group if sole else found))
+    return list(groups.values()), labels, marked
+
+
+def infer_height(spec, model) -> Iterator[str]:
+    """The trunk in "home" so high that the lowest foot touches the floor."""
+    feet = foot_ids(model)
+    if len(feet) == 0:
+        return
+    data = _home_data(model)
+    gap = min(lowest(model, data, foot) for foot in feet)
+    height = data.xpos[1, 2] - gap
+    if abs(gap) <= FLOOR_TOLERANCE * height:
+        return
+    key = spec.key("home")
+    qpos = np.array(data.qpos)
+    qpos[2] -= gap
+    key.qpos = qpos
+    side = "above" if gap > 0 else "below"
+    yield (
+        f'the feet of "home" are {abs(gap):.3f} m {side} the floor: the trunk is moved to z = '
+        f"{qpos[2]:.4f} m; to say it yourself correct the third number of qpos"
+    )
+
+
+def _home_id(model) -> int:
+    return mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_KEY, "home")
+
+
+def _home_data(model) -> mujoco.MjData:
+    """Positions of all parts in the home pose."""
+    data = mujoco.MjData(model)
+    data.qpos[:] = model.key_qpos[_home_id(model)]
+    mujoco.mj_kinematics(model, data)
+    return data

@@ -1,0 +1,8 @@
+"""Tables, figures, pictures, videos and scenes."""
+
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach(
+    __name__,
+    submodules=["opengl", "plots", "render", "scene", "software_renderer", "tables", "video"],
+)

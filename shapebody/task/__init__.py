@@ -1,0 +1,1 @@
+"""The locomotion task (Appendix A): observations, rewards, curriculum, episodes."""

@@ -1,0 +1,117 @@
+"""Observations of one environment (Appendix A), normalized by fixed divisors.
+
+The divisors of what the policy sees are those of the authors' published policies, and so is the
+gait clock, which the paper does not mention. Those of feet and privileged observations follow
+the authors' earlier environment.
+"""
+
+from dataclasses import dataclass
+
+import jax
+import jax.numpy as jnp
+
+from shapebody.design.descriptions import Descriptions
+from shapebody.task.config import TaskConfig
+from shapebody.task.sensors import Readings, up_axis
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class Observation:
+    """What the networks see of the state (leading axes allowed); all within [-10, 10].
+
+    joints: position - nominal, velocity, last action, keep-nominal flag. feet: contact,
+    time on the ground, time in the air (critic only). general: angular velocity 3,
+    command 3, gait clock 4, gravity direction 3. privileged: linear velocity 3, height 1,
+    curriculum coefficient 1 (critic only).
+    """
+
+    joints: jax.Array  # [J, 4]
+    feet: jax.Array  # [F, 3]
+    general: jax.Array  # [13]
+    privileged: jax.Array  # [5]
+
+
+COMMAND = slice(3, 6)
+"""Where the command is in the general observations."""
+
+
+def foot_contact(readings: Readings, descriptions: Descriptions):
+    """Which feet touch the floor, float32[F]: a foot's lowest point is below z = 0."""
+    # How far the half-extents of a box reach down.
+    box = jnp.sum(jnp.abs(readings.foot_down) * descriptions.foot_size, -1)
+    extent = jnp.where(descriptions.foot_is_box > 0, box, descriptions.foot_size[..., 0])
+    touching = readings.foot_position[..., 2] - extent < 0
+    return touching.astype(jnp.float32) * descriptions.foot_mask
+
+
+def sphere_collisions(readings: Readings, descriptions: Descriptions):
+    """Number of overlapping pairs of the robot's collision spheres, float32[]."""
+    position, radius, mask = (
+        readings.sphere_position,
+        descriptions.sphere_radius,
+        descriptions.sphere_mask,
+    )
+    difference = position[:, None] - position[None]
+    reach = radius[:, None] + radius[None]
+    touching = jnp.sum(difference**2, -1) <= reach**2
+    pairs = jnp.triu(mask[:, None] * mask[None], 1)
+    return jnp.sum(touching * pairs)
+
+
+def observe(
+    config: TaskConfig,
+    key,
+    readings: Readings,
+    descriptions: Descriptions,
+    command,
+    keep_nominal,
+    last_action,
+    clock,
+    contact,
+    ground_time,
+    air_time,
+    coefficient,
+) -> Observation:
+    """The observation of one environment; `clock` is the gait phase in radians."""
+    keys = jax.random.split(key, 4)
+    mask = descriptions.joint_mask
+
+    def noisy(key, value, width):
+        noise = jax.random.uniform(key, value.shape, minval=-1.0, maxval=1.0)
+        return value + coefficient * width * noise
+
+    position = noisy(keys[0], readings.joint_position, config.noise_joint_position)
+    velocity = noisy(keys[1], readings.joint_velocity, config.noise_joint_velocity)
+    angular = noisy(keys[2], readings.angular_velocity, config.noise_angular_velocity)
+    gravity = noisy(keys[3], -up_axis(readings.imu_quat), config.noise_gravity)
+    joints = jnp.stack(
+        [(position - descriptions.nominal) / 6.5, velocity / 180, last_action / 10, keep_nominal],
+        -1,
+    )
+    feet = jnp.stack(
+        [
+            2 * contact - 1,
+            jnp.clip(ground_time / 2.5 - 1, -1, 1),
+            jnp.clip(air_time / 2.5 - 1, -1, 1),
+        ],
+        -1,
+    )
+    phases = jnp.stack([clock, clock - jnp.pi])
+    general = jnp.concatenate(
+        [jnp.clip(angular / 50, -1, 1), command, jnp.sin(phases), jnp.cos(phases), gravity]
+    )
+    privileged = jnp.concatenate(
+        [
+            jnp.clip(readings.linear_velocity / 10, -1, 1),
+            jnp.clip(readings.imu_height[None] / 5 - 1, -1, 1),
+            coefficient[None],
+        ]
+    )
+    observation = Observation(
+        joints=joints * mask[:, None],
+        feet=feet * descriptions.foot_mask[:, None],
+        general=general,
+        privileged=privileged,
+    )
+    return jax.tree.map(lambda x: jnp.clip(jnp.nan_to_num(x), -10.0, 10.0), observation)

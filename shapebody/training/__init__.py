@@ -1,0 +1,1 @@
+"""PPO over randomized designs, and policy evaluation (Section 3.1, Appendix A)."""

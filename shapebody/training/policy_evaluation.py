@@ -1,0 +1,135 @@
+"""Policy evaluation: the policy is frozen, and only critics learn."""
+
+from dataclasses import replace
+
+from shapebody.agent.agent import Agent, require_agent
+from shapebody.agent.store import chosen_folder, load_agent, save_agent
+from shapebody.arguments import (
+    require_choice,
+    require_engine,
+    require_integer,
+    require_kind,
+    require_path,
+)
+from shapebody.networks.config import CriticConfig
+from shapebody.stored import from_plain as _from_plain
+from shapebody.task.config import TaskConfig
+from shapebody.training.config import MOST_STEPS, TrainConfig
+from shapebody.training.run_state import _require_budget, _require_same_robots
+from shapebody.training.train import _metadata, _run
+from shapebody.training.trainer import Trainer
+
+
+def train_critic(
+    agent: Agent,
+    critic: CriticConfig,
+    steps: int | None = None,
+    folder=None,
+    progress: bool = True,
+    max_seconds: float | None = None,
+    engine: str = "auto",
+    task_of: str = "evaluation",
+    **changes,
+) -> Agent:
+    """Policy evaluation: train a new critic for a frozen policy, at all distances from f = 0.
+
+    The task is the one that designs are evaluated on (`TaskConfig.evaluation`): every action is
+    late by one step, and the commands of small bodies are as fast as those of large ones. With
+    the task of the policy's training (`task_of="training"`, the older way), a critic takes slow
+    commands for a merit of small bodies. Notebook 04 compares the two: at λ = 100 the newer way
+    finds better bodies, at λ = 20 for the Go2 only.
+
+    The agent's policy acts on designs f ~ U([-r, r]^d) with r ~ U(0, 1), with its mean actions as
+    in evaluation: with exploration noise, the critic learns which bodies bear that noise, too. It
+    learns TD(lambda) returns, using each step once, so that more time goes into new bodies. An
+    episode lasts 200 control steps at most, since what a critic has to learn here is the design:
+    it sees more of them than with whole episodes, and the value of what follows is bootstrapped.
+    The new state bank comes from such designs and episodes too, at all distances from f = 0
+    instead of over the full design space.
+
+    Args:
+        agent: its policy is kept, its critic and state bank are replaced.
+        critic: sizes of the new critic.
+        steps: environment steps; 12 % of those that training takes at the agent's scale if not
+            given, 6 million at `reduced`.
+        folder: where the new agent is saved; data/checkpoints/<agent> by default, which replaces
+            the old critic there. The phase's own state and curve are in a folder in it, which
+            stays: a later call with more `steps` goes on from there.
+        progress, max_seconds, engine: see `train`. A phase that was stopped is continued.
+        task_of: "evaluation", or "training" for the task that the policy was trained on.
+        changes: replace fields of the TrainConfig; by default gae_lambda is 0.95, epochs is 1,
+            mean_actions is True, rollouts have at least 32 steps, and the inputs are standardized
+            at all scales.
+
+    Returns:
+        The agent with the new critic and a new state bank. Its metadata are those of the policy's
+        training, with those of this phase under "policy_evaluation". If the phase was stopped
+        before its end, `agent` itself, and nothing in the folder is replaced.
+    """
+    require_agent(agent)
+    require_kind("critic", critic, CriticConfig, "shapebody.CriticConfig.sharp()")
+    require_choice("task_of", task_of, ("evaluation", "training"))
+    if steps is not None:
+        require_integer("steps", steps, 1, MOST_STEPS)
+    require_engine("engine", engine)
+    _require_budget(None, max_seconds, progress)
+    if folder is None:
+        folder = chosen_folder(None, agent.name)
+        # The agent may come from elsewhere, and its name be that of another one here.
+        if _metadata(folder) and load_agent(folder).policy_hash != agent.policy_hash:
+            raise ValueError(
+                f"the agent in {folder} has another policy than agent {agent.name!r}, whose new "
+                "critic would be saved there; give its own folder (folder=...)"
+            )
+    folder = require_path("folder", folder)
+    missing = [name for name in ("config", "scale") if name not in agent.metadata]
+    if missing:
+        raise ValueError(
+            f"the metadata of agent {agent.name!r} lack {missing[0]!r}, which says how its policy "
+            "was trained; restore its agent.json, or train it anew"
+        )
+    what = f"metadata of agent {agent.name!r}: config"
+    trained = _from_plain(TrainConfig, agent.metadata["config"], what)
+    base = TrainConfig.at_scale(agent.metadata["scale"], trained.robots[0], name=agent.name)
+    length = max(base.rollout_length, 32)
+    config = replace(
+        base,
+        **{
+            # Robots by the names or files they were trained from.
+            "robots": trained.robots,
+            "seed": trained.seed,
+            "policy": agent.policy_config,
+            "critic": critic,
+            "standardize": True,
+            "learn_policy": False,
+            "mean_actions": True,
+            "epochs": 1,
+            "discount": trained.discount,
+            "gae_lambda": 0.95,
+            "value_lambda": None,
+            # Returns with that λ look further ahead than short rollouts reach.
+            "num_envs": base.batch // length,
+            "rollout_length": length,
+            "total_steps": base.total_steps * 12 // 100 if steps is None else steps,
+            "task": replace(
+                TaskConfig.evaluation() if task_of == "evaluation" else trained.task,
+                horizon=200,
+                design_radius=(0.0, 1.0),
+            ),
+            **changes,
+        },
+    )
+    # The state belongs to this policy: another one starts anew.
+    trainer = Trainer(config, folder / f"critic_{agent.policy_hash[:8]}", engine, agent.policy)
+    phases = agent.metadata.get("phases") or [{}]
+    _require_same_robots(phases[0].get("robots", {}), trainer.env.robots, f"agent {agent.name!r}")
+    with trainer.alone():
+        trainer.start()
+        _run(trainer, progress, None, max_seconds)
+        if trainer.steps < config.iterations * config.batch:
+            return agent
+        sharper = trainer.agent(trainer.state_bank())
+        phase = {name: sharper.metadata[name] for name in ("config", "steps", "seconds")}
+        sharper = replace(sharper, metadata={**agent.metadata, "policy_evaluation": phase})
+        save_agent(sharper, folder)
+    return sharper
