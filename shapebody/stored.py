@@ -7,11 +7,8 @@ size is compared with what is expected, and with the size of the file, before an
 
 from __future__ import annotations
 
-import dataclasses
 import json
 import math
-import types
-import typing
 import zipfile
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -89,71 +86,6 @@ def _depth(value) -> int:
         depth += 1
         level = [y for x in level for y in (x.values() if isinstance(x, dict) else x)]
     return depth
-
-
-# ---------------------------------------------------------------------- configurations
-
-
-def plain(config) -> dict:
-    """A configuration as it reads back from JSON: tuples are lists, inf is the text "Infinity"."""
-    return json.loads(json.dumps(dataclasses.asdict(config)), parse_constant=str)
-
-
-def from_plain(kind, values, what: str = ""):
-    """The inverse of `plain`: a configuration of type `kind` from what was read from JSON.
-
-    Fields that are not given keep their defaults. Raises ValueError, which names the field, for an
-    unknown one, a value of another type than the field's, and whatever `kind` itself refuses.
-    """
-    what = what or kind.__name__
-    if not isinstance(values, dict):
-        raise ValueError(f"{what} is {shown(values)}; expected an object with settings")
-    hints = typing.get_type_hints(kind)
-    unknown = sorted(values.keys() - hints.keys())
-    if unknown:
-        raise ValueError(f"{what} has the unknown setting {shown(unknown[0])}")
-    given = {name: _value(hints[name], x, f"{what}.{name}") for name, x in values.items()}
-    try:
-        return kind(**given)
-    except (TypeError, ValueError, OverflowError) as error:
-        raise ValueError(f"{what}: {error}") from error
-
-
-def _value(hint, given, what: str):
-    """A value for a field with that type hint."""
-    if dataclasses.is_dataclass(hint):
-        return from_plain(hint, given, what)
-    inside = typing.get_args(hint)
-    if typing.get_origin(hint) in (types.UnionType, typing.Union):
-        if given is None and type(None) in inside:
-            return None
-        others = [one for one in inside if one is not type(None)]
-        if len(others) == 1:
-            return _value(others[0], given, what)
-    elif typing.get_origin(hint) is tuple:
-        same = inside[1:] == (...,)
-        if not isinstance(given, list) or not (same or len(given) == len(inside)):
-            many = "a list" if same else f"a list of {len(inside)}"
-            raise ValueError(f"{what} is {shown(given)}; expected {many}")
-        hints = inside[:1] * len(given) if same else inside
-        pairs = zip(hints, given, strict=True)
-        return tuple(_value(h, x, f"{what}[{i}]") for i, (h, x) in enumerate(pairs))
-    elif hint is float and given == "Infinity":
-        return math.inf
-    elif hint in _KINDS:
-        kinds, words = _KINDS[hint]
-        number = isinstance(given, int | float) and abs(given) >= 2**63
-        if not isinstance(given, kinds) or (isinstance(given, bool) and hint is not bool) or number:
-            raise ValueError(f"{what} is {shown(given)}; expected {words}")
-    return given
-
-
-_KINDS = {
-    bool: (bool, "true or false"),
-    int: (int, "an integer"),
-    float: ((int, float), "a number"),
-    str: (str, "a text"),
-}
 
 
 # ---------------------------------------------------------------------- arrays

@@ -14,8 +14,6 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays
 from tiny import quick_compilation, tiny_agent, tiny_robot
 
-from shapebody.agent import store
-from shapebody.agent.agent import Agent
 from shapebody.agent.store import agents, load_agent, load_curve, save_agent
 from shapebody.design.descriptions import Descriptions
 from shapebody.files import atomic_write, load_arrays, save_arrays
@@ -409,9 +407,3 @@ def test_leaves_that_cannot_be_written_are_named(tmp_path):
     with pytest.raises(ValueError, match="leaf 'name' is str"):
         save_arrays(tmp_path / "x", {"name": "text"})
     assert not (tmp_path / "x").exists()
-
-
-def test_agent_is_public():
-    import shapebody
-
-    assert shapebody.Agent is Agent and shapebody.load_agent is store.load_agent

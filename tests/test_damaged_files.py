@@ -24,6 +24,7 @@ from tiny import quick_compilation, tiny_agent, tiny_robot
 from shapebody import files, stored
 from shapebody.agent import store
 from shapebody.agent.store import load_agent, load_curve, save_agent
+from shapebody.configuration import to_json
 from shapebody.reproduction import results as reproduction_results
 from shapebody.training import config as training_config
 from shapebody.training import policy_evaluation, progress, run_state
@@ -48,9 +49,7 @@ def agent(robots):
 METADATA = {
     "steps": 64,
     "scale": "smoke",
-    "config": stored.plain(
-        training_config.TrainConfig.smoke("legs_2", robots=("legs_2", "legs_3"))
-    ),
+    "config": to_json(training_config.TrainConfig.smoke("legs_2", robots=("legs_2", "legs_3"))),
     "phases": [{"from_step": 0, "config": {}, "robots": {"legs_2": "0"}}],
     "policy_evaluation": {"steps": 5, "config": {}},
 }

@@ -19,7 +19,8 @@ from shapebody.__main__ import main
 from shapebody.agent.store import save_agent
 from shapebody.design.export import balanced, ordered_ranges
 from shapebody.design.space import DesignSpace
-from shapebody.physics import MjxPhysics, NativePhysics
+from shapebody.physics.mjx import MjxPhysics
+from shapebody.physics.native import NativePhysics
 from shapebody.robot.leg_ends import foot_ids
 
 SUBSTEPS = 4  # physics steps per control step

@@ -13,9 +13,9 @@ import optax
 import pytest
 
 from shapebody.agent.store import load_agent, load_curve, save_agent
+from shapebody.configuration import from_json, to_json
 from shapebody.files import alone_in
 from shapebody.networks.config import CriticConfig
-from shapebody.stored import from_plain, plain
 from shapebody.task.observations import Observation
 from shapebody.training import config as training_config
 from shapebody.training import losses, policy_evaluation, progress, run_state, train
@@ -446,10 +446,10 @@ def test_configurations_read_back_from_json():
         training_config.TrainConfig.full("unitree_go2"),
         training_config.TrainConfig.smoke("golem", seed=3),
     ):
-        assert from_plain(training_config.TrainConfig, plain(config)) == config
+        assert from_json(training_config.TrainConfig, to_json(config)) == config
     endless = replace(config, kl_threshold=float("inf"))
-    text = json.dumps(plain(endless), allow_nan=False)  # as in the metadata of an agent
-    assert from_plain(training_config.TrainConfig, json.loads(text)) == endless
+    text = json.dumps(to_json(endless), allow_nan=False)  # as in the metadata of an agent
+    assert from_json(training_config.TrainConfig, json.loads(text)) == endless
 
 
 def test_names_of_agents():

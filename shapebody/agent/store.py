@@ -33,6 +33,7 @@ import safetensors.numpy
 
 from shapebody.agent.agent import Agent, _flat_states, _flat_weights, _flatten, _hash, require_agent
 from shapebody.arguments import require_kind, require_list, require_name, require_path, shown
+from shapebody.configuration import from_json
 from shapebody.design.descriptions import Sizes
 from shapebody.files import PENDING, current, data_dir, read_curve, replace_together, settle
 from shapebody.networks.config import CriticConfig, PolicyConfig
@@ -48,7 +49,6 @@ from shapebody.networks.policy import Policy
 from shapebody.provenance import provenance
 from shapebody.stored import (
     ARRAYS_LIMIT,
-    from_plain,
     read_json,
     read_npz,
     read_safetensors,
@@ -193,9 +193,9 @@ def _load(folder: Path) -> Agent:
         missing = [x for x in (*_CONFIGURATION, *_OTHERS) if x not in document]
         if missing:
             raise ValueError(f"{missing[0]} is missing")
-        sizes = from_plain(Sizes, document["sizes"], "sizes")
-        policy_config = from_plain(PolicyConfig, document["policy_config"], "policy_config")
-        critic_config = from_plain(CriticConfig, document["critic_config"], "critic_config")
+        sizes = from_json(Sizes, document["sizes"], "sizes")
+        policy_config = from_json(PolicyConfig, document["policy_config"], "policy_config")
+        critic_config = from_json(CriticConfig, document["critic_config"], "critic_config")
         name, robots, metadata = (document[x] for x in ("name", "robots", "metadata"))
         require_name("name", name)
         if not isinstance(robots, list) or not all(isinstance(x, str) and x for x in robots):

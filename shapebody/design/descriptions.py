@@ -15,7 +15,8 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
-from shapebody.arguments import require_integer, require_kind
+from shapebody.arguments import require_kind
+from shapebody.configuration import configuration, integer
 from shapebody.design.kinematics import _constant_rotations, _matrix, _rotate, _take, _tree
 from shapebody.design.parameters import soft_limits
 from shapebody.design.phi import Embodiment
@@ -31,17 +32,16 @@ MOST_PARTS = 10_000
 """Joints, feet or spheres of a robot."""
 
 
-@dataclass(frozen=True)
+Parts = integer(1, MOST_PARTS)
+
+
+@configuration
 class Sizes:
     """Numbers of joints, feet and collision spheres to which descriptions are padded."""
 
-    joints: int
-    feet: int
-    spheres: int
-
-    def __post_init__(self):
-        for name, least in (("joints", 1), ("feet", 1), ("spheres", 0)):
-            require_integer(name, getattr(self, name), least, MOST_PARTS)
+    joints: Parts
+    feet: Parts
+    spheres: integer(0, MOST_PARTS)
 
     @staticmethod
     def of(*robots: Robot) -> Sizes:

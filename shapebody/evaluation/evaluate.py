@@ -16,11 +16,10 @@ from shapebody.agent.agent import Agent, require_agent
 from shapebody.arguments import (
     require_engine,
     require_flag,
-    require_integer,
     require_kind,
-    require_number,
     require_seed,
 )
+from shapebody.configuration import Flag, configuration, integer, number
 from shapebody.design.space import DesignSpace
 from shapebody.evaluation.statistics import CONFIDENCE, MOST_EPISODES, _out, bootstrap_interval
 from shapebody.networks.config import PolicyConfig
@@ -32,28 +31,25 @@ from shapebody.task.env import RESET_SLOTS, Locomotion
 _CALLS = 50  # control steps between reports, and per call of an engine that runs whole rollouts
 
 
-@dataclass(frozen=True)
+Episodes = integer(1, MOST_EPISODES)
+Coefficient = number("a number from 0 to 1", ge=0, le=1)
+
+
+@configuration
 class EvaluationConfig:
     """How designs are evaluated: 200 episodes as in the paper, with `TaskConfig.evaluation`."""
 
-    episodes: int = 200
+    episodes: Episodes = 200
     """Episodes per design."""
-    coefficient: float = 1.0
+    coefficient: Coefficient = 1.0
     """Curriculum coefficient c of all episodes, in [0, 1]."""
     task: TaskConfig = field(default_factory=TaskConfig.evaluation)
     """Settings of the task."""
-    num_envs: int = 512
+    num_envs: Episodes = 512
     """Largest number of episodes that run side by side."""
-    recompute_constants: bool = False
+    recompute_constants: Flag = False
     """Native engine: recompute MuJoCo's derived constants for every design, instead of keeping
     the reference's as the paper's environment does."""
-
-    def __post_init__(self):
-        for name in ("episodes", "num_envs"):
-            require_integer(name, getattr(self, name), 1, MOST_EPISODES)
-        require_number("coefficient", self.coefficient, 0, 1)
-        require_flag("recompute_constants", self.recompute_constants)
-        require_kind("task", self.task, TaskConfig, "TaskConfig.evaluation(...)")
 
 
 @dataclass(frozen=True, eq=False)
@@ -349,7 +345,7 @@ def _environment(
     num_envs: int,
     engine: str,
     task: TaskConfig,
-    recompute_constants: bool = False,
+    recompute_constants: Flag = False,
 ) -> Locomotion:
     options = {"recompute_constants": True} if recompute_constants else None
     native = engine == "native" or (engine == "auto" and jax.default_backend() == "cpu")

@@ -1,20 +1,25 @@
 """Sizes of the policy and of the critic."""
 
-from dataclasses import dataclass
+from typing import Literal
 
-from shapebody.arguments import (
-    require_array,
-    require_choice,
-    require_integer,
-    require_list,
-    require_number,
+from shapebody.configuration import (
+    NonNegative,
+    Pair,
+    Positive,
+    configuration,
+    integer,
+    sequence,
 )
 
 WIDEST, MOST_LAYERS = 65_536, 100
 """Largest width of a layer, and largest number of layers."""
+Width = integer(1, WIDEST)
+Widths = sequence(
+    Width, f"widths of layers, at least one, each from 1 to {WIDEST:,}", 1, MOST_LAYERS
+)
 
 
-@dataclass(frozen=True)
+@configuration
 class PolicyConfig:
     """Sizes of the URMA policy. The defaults are the paper's: 945,430 parameters.
 
@@ -43,31 +48,25 @@ class PolicyConfig:
         ValueError: if the widths do not fit together or a value is out of range.
     """
 
-    key_widths: tuple[int, ...] = (256, 256)
-    value_latent: int = 4
-    core_widths: tuple[int, ...] = (512, 256, 256, 256, 256)
-    initial_temperature: float = 1.0
-    minimum_temperature: float = 0.025
-    latent_scale: float = 1.0
-    initial_std: float = 1.0
-    log_std_input: str = "tanh"
-    mean_limit: float = 10.0
-    std_limits: tuple[float, float] = (0.01, 2.0)
+    key_widths: Widths = (256, 256)
+    value_latent: Width = 4
+    core_widths: Widths = (512, 256, 256, 256, 256)
+    initial_temperature: Positive = 1.0
+    minimum_temperature: NonNegative = 0.025
+    latent_scale: Positive = 1.0
+    initial_std: Positive = 1.0
+    log_std_input: Literal["tanh", "softmax"] = "tanh"
+    mean_limit: Positive = 10.0
+    std_limits: Pair = (0.01, 2.0)
 
     def __post_init__(self):
-        _set_widths(self, "key_widths", "core_widths")
-        _check_encoder(self, "value_latent")
-        limits = require_array("std_limits", self.std_limits, (2,)).astype(float)
-        object.__setattr__(self, "std_limits", tuple(limits.tolist()))
-        require_number("initial_std", self.initial_std, above=0)
-        require_number("mean_limit", self.mean_limit, above=0)
+        _check_temperatures(self)
         if self.core_widths[-1] != self.key_widths[-1]:
             raise ValueError(
                 f"core_widths ends with {self.core_widths[-1]} and key_widths with "
                 f"{self.key_widths[-1]}; make the last widths equal, an action mean is their dot "
                 "product"
             )
-        require_choice("log_std_input", self.log_std_input, ("tanh", "softmax"))
         if not 0 < self.std_limits[0] <= self.initial_std <= self.std_limits[1]:
             raise ValueError(
                 f"initial_std is {self.initial_std}; choose it inside std_limits {self.std_limits}"
@@ -84,7 +83,7 @@ class PolicyConfig:
         return cls(**(sizes | changes))
 
 
-@dataclass(frozen=True)
+@configuration
 class CriticConfig:
     """Sizes of a URMA critic. The defaults are the paper's direct-design critic: 5,378,312
     parameters.
@@ -104,21 +103,19 @@ class CriticConfig:
         ValueError: if a value is out of range.
     """
 
-    kind: str = "direct-design"
-    heads: int = 3
-    joint_key_widths: tuple[int, ...] = (64, 64)
-    joint_value_latent: int = 32
-    foot_key_widths: tuple[int, ...] = (32, 32)
-    foot_value_latent: int = 32
-    head_widths: tuple[int, ...] = (512, 256, 128, 128, 128)
-    initial_temperature: float = 1.0
-    minimum_temperature: float = 0.025
-    latent_scale: float = 1.0
+    kind: Literal["direct-design", "original"] = "direct-design"
+    heads: Width = 3
+    joint_key_widths: Widths = (64, 64)
+    joint_value_latent: Width = 32
+    foot_key_widths: Widths = (32, 32)
+    foot_value_latent: Width = 32
+    head_widths: Widths = (512, 256, 128, 128, 128)
+    initial_temperature: Positive = 1.0
+    minimum_temperature: NonNegative = 0.025
+    latent_scale: Positive = 1.0
 
     def __post_init__(self):
-        _set_widths(self, "joint_key_widths", "foot_key_widths", "head_widths")
-        _check_encoder(self, "joint_value_latent", "foot_value_latent", "heads")
-        require_choice("kind", self.kind, ("direct-design", "original"))
+        _check_temperatures(self)
 
     @classmethod
     def original(cls, **changes) -> "CriticConfig":
@@ -148,25 +145,9 @@ class CriticConfig:
         return cls.reduced(**(sizes | changes))
 
 
-def _set_widths(config, *names):
-    """Turn the named fields into tuples of int, so that a config read from JSON stays hashable."""
-    for name in names:
-        widths = require_list(name, getattr(config, name), MOST_LAYERS)
-        widths = tuple(require_integer(f"a width in {name}", x, 1, WIDEST) for x in widths)
-        if not widths:
-            raise ValueError(f"{name} is {widths}; expected at least one width, all positive")
-        object.__setattr__(config, name, widths)
-
-
-def _check_encoder(config, *positive):
-    for name in positive:
-        require_integer(name, getattr(config, name), 1, WIDEST)
-    for name in ("initial_temperature", "minimum_temperature", "latent_scale"):
-        require_number(name, getattr(config, name))
-    if not 0 <= config.minimum_temperature < config.initial_temperature:
+def _check_temperatures(config):
+    if not config.minimum_temperature < config.initial_temperature:
         raise ValueError(
             f"initial_temperature is {config.initial_temperature}; choose it above "
             f"minimum_temperature {config.minimum_temperature}"
         )
-    if not config.latent_scale > 0:
-        raise ValueError(f"latent_scale is {config.latent_scale}; expected a positive number")

@@ -2,38 +2,30 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 
+from shapebody.configuration import Count, Positive, Share, configuration
 from shapebody.optimizers.loop import (
     Search,
     Steps,
     iterate,
-    require,
-    require_integers,
-    require_positive,
 )
 
 
-@dataclass(frozen=True)
+@configuration
 class ARSConfig:
     """Settings of augmented random search; the defaults are the paper's."""
 
-    iterations: int = 50
-    directions: int = 16
+    iterations: Count = 50
+    directions: Count = 16
     """Random directions per iteration, each tried both ways."""
-    perturbation_std: float = 0.1
-    learning_rate: float = 0.05
-    top_fraction: float = 1.0
+    perturbation_std: Positive = 0.1
+    learning_rate: Positive = 0.05
+    top_fraction: Share = 1.0
     """Part of the directions, by the better of their two values, that is used."""
-
-    def __post_init__(self):
-        require_integers(self, "iterations", "directions")
-        require_positive(self, "perturbation_std", "learning_rate")
-        require(self, "a number above 0 and at most 1", lambda x: 0 < x <= 1, "top_fraction")
 
     @property
     def top(self) -> int:

@@ -3,36 +3,32 @@
 from __future__ import annotations
 
 import warnings
-from dataclasses import dataclass
 
 import jax
 import numpy as np
 
-from shapebody.optimizers.loop import Search, cores, last_finite, require_integers, score, start_key
+from shapebody.configuration import Count, configuration, integer
+from shapebody.optimizers.loop import Search, cores, last_finite, score, start_key
 
 PROCESSES = 4
 """Most Python processes that a search starts."""
 
 
-@dataclass(frozen=True)
+@configuration
 class BOConfig:
     """Settings of Bayesian optimization; the defaults are the paper's."""
 
-    iterations: int = 50
+    iterations: Count = 50
     """Designs chosen by the acquisition function, one per iteration."""
-    initial_points: int = 10
+    initial_points: integer(2) = 10
     """Points before the first iteration: the start design, then Sobol points."""
-    restarts: int = 8
+    restarts: Count = 8
     """Starting points of the acquisition function's optimization."""
-    raw_samples: int = 256
+    raw_samples: Count = 256
     """Points among which these are chosen."""
-    steps: int = 50
+    steps: Count = 50
     """Most steps of that optimization. The paper does not say; BoTorch's 200 take three times as
     long."""
-
-    def __post_init__(self):
-        require_integers(self, "iterations", "restarts", "raw_samples", "steps")
-        require_integers(self, "initial_points", least=2)
 
 
 def bo(objective, starts, key, config: BOConfig) -> Search:

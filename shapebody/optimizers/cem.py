@@ -2,39 +2,31 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 
+from shapebody.configuration import Count, Positive, Share, configuration
 from shapebody.optimizers.loop import (
     Search,
     Steps,
     iterate,
-    require,
-    require_integers,
-    require_positive,
 )
 
 
-@dataclass(frozen=True)
+@configuration
 class CEMConfig:
     """Settings of the cross-entropy method; the defaults are the paper's."""
 
-    iterations: int = 50
-    particles: int = 32
+    iterations: Count = 50
+    particles: Count = 32
     """Samples per iteration."""
-    elite_fraction: float = 0.2
+    elite_fraction: Share = 0.2
     """Part of the samples to which the Gaussian is fitted."""
-    initial_std: float = 0.5
-    minimum_std: float = 0.02
+    initial_std: Positive = 0.5
+    minimum_std: Positive = 0.02
     """Floor of every standard deviation."""
-
-    def __post_init__(self):
-        require_integers(self, "iterations", "particles")
-        require(self, "a number above 0 and at most 1", lambda x: 0 < x <= 1, "elite_fraction")
-        require_positive(self, "initial_std", "minimum_std")
 
     @property
     def elites(self) -> int:

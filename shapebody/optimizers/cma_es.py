@@ -4,38 +4,30 @@ from __future__ import annotations
 
 import math
 import warnings
-from dataclasses import dataclass
 
 import jax
 import numpy as np
 
 from shapebody.arguments import require_integer
+from shapebody.configuration import Count, Positive, configuration, integer
 from shapebody.optimizers.loop import (
     Search,
     last_finite,
-    require_integers,
-    require_positive,
     score,
     start_key,
 )
 
 
-@dataclass(frozen=True)
+@configuration
 class CMAESConfig:
     """Settings of CMA-ES; the defaults are the paper's."""
 
-    iterations: int = 50
+    iterations: Count = 50
     """Number of generations."""
-    initial_std: float = 0.5
+    initial_std: Positive = 0.5
     """Initial step size σ_0."""
-    particles: int | None = None
+    particles: integer(2) | None = None
     """Population size; 4 + ⌊3 ln d⌋ if None."""
-
-    def __post_init__(self):
-        require_integers(self, "iterations")
-        require_positive(self, "initial_std")
-        if self.particles is not None:
-            require_integers(self, "particles", least=2)
 
     def population(self, dim: int) -> int:
         """Population size for designs of length `dim`, 21 for the Go2's 358."""

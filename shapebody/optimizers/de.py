@@ -2,42 +2,32 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 
+from shapebody.configuration import Count, Positive, Probability, configuration, integer, number
 from shapebody.optimizers.loop import (
     Search,
     Steps,
     initial_population,
     iterate,
-    require,
-    require_integers,
-    require_std,
 )
 
 
-@dataclass(frozen=True)
+@configuration
 class DEConfig:
     """Settings of differential evolution; the defaults are the paper's."""
 
-    iterations: int = 50
-    particles: int = 32
-    weight: float = 0.5
+    iterations: Count = 50
+    particles: integer(4) = 32
+    weight: number("a number from 0 to 2", ge=0, le=2) = 0.5
     """Differential weight F."""
-    crossover: float = 0.9
+    crossover: Probability = 0.9
     """CR, probability that a parameter comes from the mutant."""
-    initial_std: float | None = None
+    initial_std: Positive | None = None
     """Standard deviation of the initial particles around the start; uniform in the box if None."""
-
-    def __post_init__(self):
-        require_integers(self, "iterations")
-        require_integers(self, "particles", least=4)
-        require(self, "a number from 0 to 2", lambda x: 0 <= x <= 2, "weight")
-        require(self, "a probability", lambda x: 0 <= x <= 1, "crossover")
-        require_std(self)
 
 
 class _Population(NamedTuple):

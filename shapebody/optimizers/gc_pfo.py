@@ -7,35 +7,30 @@ covariance of the gradients. What that leaves open is chosen here, as `gc_pfo` s
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 
-from shapebody.optimizers.loop import Search, Steps, iterate, require_integers, require_positive
+from shapebody.configuration import Count, Positive, configuration, integer
+from shapebody.optimizers.loop import Search, Steps, iterate
 
 
-@dataclass(frozen=True)
+@configuration
 class GCPFOConfig:
     """Settings of GC-PFO; the defaults are the paper's."""
 
-    iterations: int = 50
-    regions: int = 2
+    iterations: Count = 50
+    regions: Count = 2
     """Populations that are resampled apart and have a gradient covariance each."""
-    particles: int = 32
+    particles: integer(2) = 32
     """Particles per region."""
-    step_size: float = 0.2
+    step_size: Positive = 0.2
     """Root mean square of the first noise on a parameter."""
-    temperature: float = 1.0
+    temperature: Positive = 1.0
     """τ_0, of the first resampling."""
-    epsilon: float = 1e-8
+    epsilon: Positive = 1e-8
     """ε, keeps divisions by spreads and gradients of zero finite."""
-
-    def __post_init__(self):
-        require_integers(self, "iterations", "regions")
-        require_integers(self, "particles", least=2)
-        require_positive(self, "step_size", "temperature", "epsilon")
 
 
 class _Regions(NamedTuple):

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import numbers
 import os
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
@@ -13,12 +12,10 @@ import jax
 import jax.numpy as jnp
 
 from shapebody.arguments import (
-    refuse,
     require_array,
     require_integer,
     require_key,
     require_kind,
-    require_number,
 )
 
 MOST = 1_000_000
@@ -151,26 +148,6 @@ def last_finite(trajectory, history):
     return jnp.take_along_axis(trajectory, last[None, :, None], axis=0)[0]
 
 
-def require(config, expected: str, valid: Callable[[float], bool], *names: str) -> None:
-    """ValueError naming the first of the settings `names` of `config` that is not `valid`."""
-    for name in names:
-        value = getattr(config, name)
-        if isinstance(value, bool) or not isinstance(value, numbers.Real) or not valid(value):
-            raise refuse(name, value, expected)
-
-
-def require_integers(config, *names: str, least: int = 1) -> None:
-    """ValueError naming the first setting of `names` that is no integer of at least `least`."""
-    for name in names:
-        require_integer(name, getattr(config, name), least, MOST)
-
-
-def require_positive(config, *names: str) -> None:
-    """ValueError naming the first of the settings `names` that is not positive and finite."""
-    for name in names:
-        require_number(name, getattr(config, name), above=0)
-
-
 def initial_population(config, start, key):
     """Initial population [P, d], the start [d] first; uniform, or Gaussian around the start."""
     shape = (config.particles, len(start))
@@ -179,8 +156,3 @@ def initial_population(config, start, key):
     else:
         others = jnp.clip(start + config.initial_std * jax.random.normal(key, shape), -1.0, 1.0)
     return others.at[0].set(start)
-
-
-def require_std(config):
-    if config.initial_std is not None:
-        require_positive(config, "initial_std")

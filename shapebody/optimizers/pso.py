@@ -2,44 +2,34 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 
+from shapebody.configuration import Count, NonNegative, Positive, configuration
 from shapebody.optimizers.loop import (
     Search,
     Steps,
     initial_population,
     iterate,
-    require,
-    require_integers,
-    require_std,
 )
 
 
-@dataclass(frozen=True)
+@configuration
 class PSOConfig:
     """Settings of particle swarm optimization; the defaults are the paper's."""
 
-    iterations: int = 50
-    particles: int = 32
-    inertia: float = 0.9
+    iterations: Count = 50
+    particles: Count = 32
+    inertia: NonNegative = 0.9
     """w, the part of a velocity that is kept."""
-    cognitive: float = 0.5
+    cognitive: NonNegative = 0.5
     """c_1, pull towards a particle's own best design."""
-    social: float = 0.3
+    social: NonNegative = 0.3
     """c_2, pull towards the best design of the swarm."""
-    initial_std: float | None = None
+    initial_std: Positive | None = None
     """Standard deviation of the initial particles around the start; uniform in the box if None."""
-
-    def __post_init__(self):
-        require_integers(self, "iterations", "particles")
-        expected = "a finite number of at least 0"
-        names = ("inertia", "cognitive", "social")
-        require(self, expected, lambda x: 0 <= x < float("inf"), *names)
-        require_std(self)
 
 
 class _Swarm(NamedTuple):

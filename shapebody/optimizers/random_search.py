@@ -2,26 +2,23 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 
-from shapebody.optimizers.loop import Search, Steps, iterate, require_integers
+from shapebody.configuration import Count, configuration
+from shapebody.optimizers.loop import Search, Steps, iterate
 
 
-@dataclass(frozen=True)
+@configuration
 class RandomConfig:
     """Settings of random search; 50 × 64 are the paper's 3200 designs."""
 
-    iterations: int = 50
+    iterations: Count = 50
     """Number N of minibatches."""
-    candidates: int = 64
+    candidates: Count = 64
     """Designs drawn and scored per minibatch."""
-
-    def __post_init__(self):
-        require_integers(self, "iterations", "candidates")
 
 
 class _Best(NamedTuple):

@@ -2,47 +2,42 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 
+from shapebody.configuration import Count, Positive, Share, configuration, number
 from shapebody.optimizers.loop import (
     Search,
     Steps,
     iterate,
-    require,
-    require_integers,
-    require_positive,
 )
 
 
-@dataclass(frozen=True)
+@configuration
 class TuRBOConfig:
     """Settings of adaptive trust-region random search; the defaults are the paper's."""
 
-    iterations: int = 50
-    candidates: int = 64
+    iterations: Count = 50
+    candidates: Count = 64
     """Designs drawn from the trust box per iteration."""
-    radius: float = 0.1
+    radius: Positive = 0.1
     """Initial half width of the trust box."""
-    minimum_radius: float = 0.005
-    maximum_radius: float = 0.5
-    shrink: float = 0.7
+    minimum_radius: Positive = 0.005
+    maximum_radius: Positive = 0.5
+    shrink: Share = 0.7
     """Factor on the radius after an iteration without improvement."""
-    expand: float = 1.3
+    expand: number("a finite number of at least 1", ge=1) = 1.3
     """Factor on the radius after an improvement."""
 
     def __post_init__(self):
-        require_integers(self, "iterations", "candidates")
-        require_positive(self, "minimum_radius", "maximum_radius")
         low, high = self.minimum_radius, self.maximum_radius
-        if low > high:
-            raise ValueError(f"minimum_radius is {low}; expected at most maximum_radius, {high}")
-        require(self, f"a number from {low} to {high}", lambda x: low <= x <= high, "radius")
-        require(self, "a number above 0 and at most 1", lambda x: 0 < x <= 1, "shrink")
-        require(self, "a finite number of at least 1", lambda x: 1 <= x < float("inf"), "expand")
+        if not low <= self.radius <= high:
+            raise ValueError(
+                f"radius is {self.radius}; expected minimum_radius <= radius <= maximum_radius, "
+                f"which are {low} and {high}"
+            )
 
 
 class _TrustBox(NamedTuple):

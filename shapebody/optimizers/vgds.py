@@ -2,36 +2,30 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from functools import partial
 
 import jax
 import jax.numpy as jnp
 import optax
 
+from shapebody.configuration import Count, Positive, configuration
 from shapebody.optimizers.loop import (
     Search,
     last_finite,
-    require_integers,
-    require_positive,
     values_and_gradients,
 )
 
 
-@dataclass(frozen=True)
+@configuration
 class VGDSConfig:
     """Settings of VGDS; the defaults are the paper's."""
 
-    iterations: int = 50
+    iterations: Count = 50
     """Number N of gradient steps."""
-    learning_rate: float = 0.05
+    learning_rate: Positive = 0.05
     """Step size of Adam, in units of the normalized design."""
-    max_update: float = 0.1
+    max_update: Positive = 0.1
     """δ_max, the largest change of one design parameter in one iteration."""
-
-    def __post_init__(self):
-        require_integers(self, "iterations")
-        require_positive(self, "learning_rate", "max_update")
 
 
 def vgds(objective, starts, key, config: VGDSConfig) -> Search:

@@ -1,21 +1,25 @@
 """The settings of a training run."""
 
-import math
 import os
-from dataclasses import dataclass, field
+from dataclasses import field
 from pathlib import Path
+from typing import Annotated, Literal
 
-from shapebody.arguments import (
-    refuse,
-    require_choice,
-    require_flag,
-    require_integer,
-    require_kind,
-    require_list,
-    require_name,
-    require_number,
-    require_path,
-    require_seed,
+from pydantic import BeforeValidator, Field
+
+from shapebody.arguments import require_choice, require_list, require_name, require_path
+from shapebody.configuration import (
+    FileName,
+    Flag,
+    NonNegative,
+    Pair,
+    Positive,
+    Probability,
+    Seed,
+    Threshold,
+    configuration,
+    expecting,
+    integer,
 )
 from shapebody.files import data_dir
 from shapebody.networks.config import CriticConfig, PolicyConfig
@@ -29,101 +33,86 @@ SCALES = ("smoke", "reduced", "full")
 """Names of the sizes at which everything can be computed."""
 
 
-@dataclass(frozen=True)
+def as_robots(robots) -> tuple[str, ...]:
+    """One name or path, or a list of them, as a tuple of texts."""
+    single = isinstance(robots, str | Path)
+    robots = (robots,) if single else require_list("robots", robots, 1000)
+    for robot in robots:
+        robot_name(robot)
+    return tuple(str(robot) for robot in robots)
+
+
+Size = integer(1, 2**24)
+Robots = Annotated[
+    tuple[str, ...],
+    Field(min_length=1),
+    BeforeValidator(as_robots),
+    expecting("at least one name or path of a robot"),
+]
+
+
+@configuration
 class TrainConfig:
     """A training run. Defaults are the paper's single-robot run (Appendix A, PPO table)."""
 
-    name: str
+    name: FileName
     """Name of the agent and of its folder in data/checkpoints."""
-    robots: tuple[str, ...]
+    robots: Robots
     """Robots to train on, names or paths; environments are shared out evenly."""
-    scale: str = "full"
-    seed: int = 0
+    scale: Literal["smoke", "reduced", "full"] = "full"
+    seed: Seed = 0
 
     policy: PolicyConfig = field(default_factory=PolicyConfig)
     critic: CriticConfig = field(default_factory=CriticConfig)
-    standardize: bool = False
+    standardize: Flag = False
     """Standardize the network's inputs over the design distribution."""
 
-    num_envs: int = 4096
-    rollout_length: int = 64
+    num_envs: Size = 4096
+    rollout_length: Size = 64
     """Control steps per environment and iteration."""
-    total_steps: int = 1_000_000_000
-    minibatch_size: int = 16_384
+    total_steps: integer(1, MOST_STEPS) = 1_000_000_000
+    minibatch_size: Size = 16_384
     """Control steps per gradient step: whole environments times the rollout length. If it does not
     divide the batch (15,040 environments), every epoch leaves out some environments at random."""
-    epochs: int = 10
-    learning_rate: tuple[float, float] = (1.5e-3, 3e-4)
+    epochs: Size = 10
+    learning_rate: Pair = (1.5e-3, 3e-4)
     """At the first and at the last step; linear between."""
-    discount: float = 0.99
-    gae_lambda: float = 0.7
-    value_lambda: float | None = None
+    discount: Probability = 0.99
+    gae_lambda: Probability = 0.7
+    value_lambda: Probability | None = None
     """gae_lambda of the critic's targets, if not the same. With short rollouts and few gradient
     steps, a small one makes the critic learn slowly what lasts longer than 1 / (1 - lambda) steps.
     """
-    cut_at_commands: bool = False
+    cut_at_commands: Flag = False
     """The policy's advantages end where the command changes, as if the episode were truncated. No
     action causes that change, so what the new command is worth is only noise to the policy."""
-    clip_range: float = 0.1
-    entropy_coefficient: float = 0.005
-    max_gradient_norm: float = 3.0
-    kl_threshold: float = 0.5
+    clip_range: Positive = 0.1
+    entropy_coefficient: NonNegative = 0.005
+    max_gradient_norm: Positive = 3.0
+    kl_threshold: Threshold = 0.5
     """The rest of an iteration's updates is skipped once a minibatch exceeds this; inf: never."""
 
     task: TaskConfig = field(default_factory=TaskConfig)
-    learn_policy: bool = True
+    learn_policy: Flag = True
     """False in the policy-evaluation phase: only the critic learns, at c = 1."""
-    mean_actions: bool = False
+    mean_actions: Flag = False
     """Act without exploration noise, as in evaluation; only if the policy does not learn."""
-    state_bank: int = 2048
+    state_bank: Size = 2048
     """States kept for design search."""
 
     def __post_init__(self):
-        single = isinstance(self.robots, str | Path)
-        robots = (self.robots,) if single else tuple(require_list("robots", self.robots, 1000))
-        names = [_robot_name(robot) for robot in robots]
-        robots = tuple(str(robot) for robot in robots)
-        object.__setattr__(self, "robots", robots)
-        if not robots:
-            raise ValueError("robots is (); expected at least one name or path")
+        names = [robot_name(robot) for robot in self.robots]
         if len(set(names)) < len(names):
             raise ValueError(
-                f"robots is {robots!r}; expected robots of different names: a robot is known by "
-                "the name of its file, so leave out repeated ones, or copy a file to another name"
+                f"robots is {self.robots!r}; expected robots of different names: a robot is known "
+                "by the name of its file, so leave out repeated ones, or copy a file to another "
+                "name"
             )
-        require_name("name", self.name)
-        counts = ("num_envs", "rollout_length", "total_steps", "minibatch_size", "epochs")
-        for name in (*counts, "state_bank"):
-            value = getattr(self, name)
-            most = MOST_STEPS if name == "total_steps" else 2**24
-            object.__setattr__(self, name, require_integer(name, value, 1, most))
-        for name in ("discount", "gae_lambda", "value_lambda"):
-            if name != "value_lambda" or self.value_lambda is not None:
-                require_number(name, getattr(self, name), 0, 1)
-        object.__setattr__(self, "seed", require_seed("seed", self.seed))
-        for name, kind in (("policy", PolicyConfig), ("critic", CriticConfig)):
-            hint = f"shapebody.{kind.__name__}.reduced(...)"
-            require_kind(name, getattr(self, name), kind, hint)
-        require_kind("task", self.task, TaskConfig, "shapebody.TaskConfig(...)")
-        for name in ("standardize", "cut_at_commands", "learn_policy", "mean_actions"):
-            require_flag(name, getattr(self, name))
         if self.learn_policy and self.mean_actions:
             raise ValueError(
                 "mean_actions is True, but a policy learns from its exploration; expected "
                 "learn_policy=False with it"
             )
-        require_choice("scale", self.scale, SCALES)
-        require_number("entropy_coefficient", self.entropy_coefficient, 0)
-        for name in ("clip_range", "max_gradient_norm", "kl_threshold"):
-            value = getattr(self, name)
-            if not (name == "kl_threshold" and isinstance(value, float) and value == math.inf):
-                require_number(name, value, above=0)
-        rates = self.learning_rate
-        if not isinstance(rates, tuple | list) or len(rates) != 2:
-            expected = "two numbers of at least 0, for the first and for the last step"
-            raise refuse("learning_rate", rates, expected)
-        rates = tuple(require_number("a rate in learning_rate", rate, 0) for rate in rates)
-        object.__setattr__(self, "learning_rate", rates)
         batch = self.num_envs * self.rollout_length
         if self.minibatch_size % self.rollout_length or self.minibatch_size > batch:
             raise ValueError(
@@ -203,17 +192,16 @@ class TrainConfig:
 def _default_name(robot: str, changes: dict) -> str:
     """Name of an agent: its robots' names, or those of their files, joined with "+"."""
     robots = changes.get("robots", (robot,))
-    robots = (robots,) if isinstance(robots, str | Path) else require_list("robots", robots)
-    return "+".join(_robot_name(name) for name in robots)
+    return "+".join(robot_name(name) for name in as_robots(robots))
 
 
-def _robot_name(name_or_path) -> str:
+def robot_name(name_or_path) -> str:
     """The name of a robot that is given by name or file, without reading the file."""
     path = require_path("robot", name_or_path)
     return require_name("the name of the robot's file", path.stem)
 
 
-def _located(robot: str) -> str:
+def located(robot: str) -> str:
     """A robot as runs store it: a shipped one by name, a file by its absolute path, so that it is
     the same robot in every working directory."""
     try:

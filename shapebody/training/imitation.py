@@ -20,8 +20,8 @@ import optax
 
 from shapebody.agent.agent import Agent
 from shapebody.arguments import require_engine, require_flag, require_integer, require_kind
+from shapebody.configuration import to_json
 from shapebody.networks.policy import Policy
-from shapebody.stored import plain as _plain
 from shapebody.task.env import Locomotion
 from shapebody.training.config import MOST_STEPS, TrainConfig
 from shapebody.training.trainer import Failures, Trainer
@@ -97,7 +97,7 @@ def begin_run(
         trainer.phases[0]["imitated"] = {
             "agent": teacher.name,
             "policy_hash": teacher.policy_hash,
-            "policy": _plain(teacher.policy_config),
+            "policy": to_json(teacher.policy_config),
             "agent_steps": teacher.metadata.get("steps"),
             "steps": max(1, steps // config.batch) * config.batch,
             "seconds": round(time.monotonic() - began, 1),

@@ -11,8 +11,8 @@ from shapebody.arguments import (
     require_kind,
     require_path,
 )
+from shapebody.configuration import from_json
 from shapebody.networks.config import CriticConfig
-from shapebody.stored import from_plain as _from_plain
 from shapebody.task.config import TaskConfig
 from shapebody.training.config import MOST_STEPS, TrainConfig
 from shapebody.training.run_state import _require_budget, _require_same_robots
@@ -89,7 +89,7 @@ def train_critic(
             "was trained; restore its agent.json, or train it anew"
         )
     what = f"metadata of agent {agent.name!r}: config"
-    trained = _from_plain(TrainConfig, agent.metadata["config"], what)
+    trained = from_json(TrainConfig, agent.metadata["config"], what)
     base = TrainConfig.at_scale(agent.metadata["scale"], trained.robots[0], name=agent.name)
     length = max(base.rollout_length, 32)
     config = replace(

@@ -12,10 +12,9 @@ from shapebody.arguments import (
     require_number,
     shown,
 )
-from shapebody.stored import from_plain as _from_plain
-from shapebody.stored import plain as _plain
+from shapebody.configuration import from_json, to_json
 from shapebody.stored import read_json, read_number
-from shapebody.training.config import MOST_STEPS, TrainConfig, _located, _robot_name
+from shapebody.training.config import MOST_STEPS, TrainConfig, located, robot_name
 
 
 def _version(folder: Path):
@@ -74,12 +73,12 @@ def as_continued(config: TrainConfig, folder=None) -> TrainConfig:
     if not (folder / "training.safetensors").exists():
         return config
     try:
-        last = _from_plain(TrainConfig, _phases(folder / "training.json")[-1].get("config"))
+        last = from_json(TrainConfig, _phases(folder / "training.json")[-1].get("config"))
     except (OSError, ValueError):
         return config  # nothing to continue, or a damaged file, which `Trainer.start` reports
 
     def identity(config):
-        return config.name, [_robot_name(robot) for robot in config.robots], config.scale
+        return config.name, [robot_name(robot) for robot in config.robots], config.scale
 
     # Their files may have moved; `Trainer.start` compares them with those of the run.
     return replace(last, robots=config.robots) if identity(last) == identity(config) else config
@@ -160,21 +159,21 @@ def _continued(path: Path, config: TrainConfig, steps: int, robots=()) -> list[d
     phases = _phases(path)
     try:
         # Settings that are newer than the run are at their defaults in it.
-        last = _from_plain(TrainConfig, phases[-1].get("config"), "config")
+        last = from_json(TrainConfig, phases[-1].get("config"), "config")
     except ValueError as error:
         raise ValueError(
             f"{path.name} of the run in {path.parent} is damaged, or has settings that this "
             f"version of shapebody does not know ({error}); continue it with the version that "
             f"began it, or {ANEW}"
         ) from error
-    before = _plain(replace(last, robots=tuple(_located(robot) for robot in last.robots)))
+    before = to_json(replace(last, robots=tuple(located(robot) for robot in last.robots)))
     known = phases[0].get("robots", {})
-    if [r.name for r in robots] == [_robot_name(r) for r in last.robots] and all(
+    if [r.name for r in robots] == [robot_name(r) for r in last.robots] and all(
         r.name in known for r in robots
     ):
         # Files that have only moved are the same robots: their hashes are compared below.
         before["robots"] = list(config.robots)
-    now = _plain(config)
+    now = to_json(config)
     different = [name for name in now if before.get(name) != now[name]]
     changeable = list(CHANGEABLE)
     for field_name, inside in CHANGEABLE_INSIDE.items():

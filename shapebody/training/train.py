@@ -9,8 +9,8 @@ from pathlib import Path
 from shapebody.agent.agent import Agent
 from shapebody.agent.store import chosen_folder, load_agent, read_metadata
 from shapebody.arguments import require_engine, require_flag, require_integer, require_number
+from shapebody.configuration import from_json
 from shapebody.files import atomic_write
-from shapebody.stored import from_plain as _from_plain
 from shapebody.stored import read_json
 from shapebody.training.config import MOST_STEPS, TrainConfig
 from shapebody.training.run_state import (
@@ -203,9 +203,7 @@ def _begin_annealing(
     done = _iterations(folder)
     phases = _phases(folder / "training.json")
     # Checked, but kept as it was written: the copy continues from it.
-    _from_plain(
-        TrainConfig, phases[-1].get("config"), f"the configuration in {folder}/training.json"
-    )
+    from_json(TrainConfig, phases[-1].get("config"), f"the configuration in {folder}/training.json")
     config = dict(phases[-1]["config"])
     batch = config["num_envs"] * config["rollout_length"]
     first, last = config["learning_rate"]
@@ -239,7 +237,7 @@ def _begin_annealing(
         atomic_write(copy / "training.csv", (folder / "training.csv").read_bytes())
         # The state comes last: a copy without it is made again.
         atomic_write(copy / "training.safetensors", state)
-    return _from_plain(TrainConfig, config)
+    return from_json(TrainConfig, config)
 
 
 def _run(trainer: Trainer, progress, max_steps, max_seconds) -> None:

@@ -27,6 +27,7 @@ import numpy as np
 from shapebody.agent.agent import Agent
 from shapebody.agent.store import chosen_folder, save_agent
 from shapebody.arguments import refuse, require_integer, require_path
+from shapebody.configuration import to_json
 from shapebody.files import alone_in, atomic_write, load_arrays, save_arrays
 from shapebody.networks.critic import Critic
 from shapebody.networks.inputs import initialize, standardization
@@ -34,9 +35,8 @@ from shapebody.networks.policy import Policy
 from shapebody.robot.robot import load_robot
 from shapebody.runtime import keep_memory
 from shapebody.stored import ARRAYS_LIMIT
-from shapebody.stored import plain as _plain
 from shapebody.task.env import Locomotion, Trajectory
-from shapebody.training.config import MOST_STEPS, TrainConfig, _located
+from shapebody.training.config import MOST_STEPS, TrainConfig, located
 from shapebody.training.progress import CURVE_INTERVAL, _Curve, _Report, _rows
 from shapebody.training.run_state import (
     STATE_FILES,
@@ -77,7 +77,7 @@ class Trainer:
         if policy is not None and not (isinstance(policy, Mapping) and "params" in policy):
             raise refuse("policy", policy, "variables of a Policy, such as agent.policy")
         keep_memory()
-        robots = tuple(_located(robot) for robot in config.robots)
+        robots = tuple(located(robot) for robot in config.robots)
         config = config if robots == config.robots else replace(config, robots=robots)
         self.config = config
         self.folder = chosen_folder(folder, config.name)
@@ -200,7 +200,7 @@ class Trainer:
         self.saved_physics = self.env.physics_arrays() if native else self.env.physics_state
         if not resumed:
             robots = {robot.name: robot.hash for robot in self.env.robots}
-            first = {"from_step": 0, "config": _plain(self.config)}
+            first = {"from_step": 0, "config": to_json(self.config)}
             self.phases = [first | {"robots": robots, "engine": self.env.engine}]
             return False
         saved = load_arrays(path, self._everything())
@@ -214,7 +214,7 @@ class Trainer:
         """The agent as trained so far."""
         config = self.config
         metadata = {
-            "config": _plain(config),
+            "config": to_json(config),
             "phases": self.phases,
             "scale": config.scale,
             "engine": self.env.engine,
