@@ -21,7 +21,7 @@ from shapebody.design.export import balanced, ordered_ranges
 from shapebody.design.space import DesignSpace
 from shapebody.physics.mjx import MjxPhysics
 from shapebody.physics.native import NativePhysics
-from shapebody.robot.leg_ends import foot_ids
+from shapebody.robot.feet import foot_ids
 
 SUBSTEPS = 4  # physics steps per control step
 SECONDS = 2.0

@@ -9,6 +9,7 @@ import pytest
 from PIL import Image
 from walker import WALKER
 
+from shapebody.robot.geometry import standing_pose
 from shapebody.show import opengl, render, video
 
 
@@ -101,14 +102,14 @@ def test_opengl_is_found_after_mujoco_was_imported():
 
 def test_standing_pose_touches_the_floor(model):
     # Foot centre 0.3 below the trunk, radius 0.04.
-    assert render.standing_pose(model)[2] == pytest.approx(0.34)
+    assert standing_pose(model)[2] == pytest.approx(0.34)
 
 
 def test_standing_pose_is_the_home_keyframe():
     def knee(keys):
         keys = "".join(f"<key {name} qpos='0 0 1 1 0 0 0 {angle}'/>" for name, angle in keys)
         text = WALKER.replace("</mujoco>", f"<keyframe>{keys}</keyframe></mujoco>")
-        return render.standing_pose(mujoco.MjModel.from_xml_string(text))[7]
+        return standing_pose(mujoco.MjModel.from_xml_string(text))[7]
 
     assert knee([("name='crouch'", 0.9), ("name='home'", 0.2)]) == 0.2
     assert knee([("name='crouch'", 0.9), ("", 0.2)]) == 0.9

@@ -10,9 +10,9 @@ from collections.abc import Iterator
 import mujoco
 import numpy as np
 
+from shapebody.robot.geometry import standing_pose
 from shapebody.robot.robot import Robot
 from shapebody.robot.spec_edits import comment
-from shapebody.robot.standing import standing_pose
 
 TIGHT_RANGE = 0.001  # rad, half width of the exported range of a joint whose limits have crossed
 
@@ -59,7 +59,7 @@ def build_model(robot: Robot, embodiment, scale) -> mujoco.MjModel:
     set_numeric(model, "velocity_limits", embodiment.velocity_limits)
     nominal = np.asarray(embodiment.nominal, np.float64)
     home = model.key("home").id
-    model.key_qpos[home] = standing_pose(robot, model, nominal)
+    model.key_qpos[home] = standing_pose(model, robot.pose(nominal), robot.feet)
     model.key_ctrl[home] = nominal
     return model
 

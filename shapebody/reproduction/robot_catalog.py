@@ -9,8 +9,8 @@ import numpy as np
 from shapebody.arguments import require_integer, require_list, require_seed, shown
 from shapebody.design.space import DesignSpace
 from shapebody.physics.native import NativePhysics
+from shapebody.robot.geometry import standing_pose
 from shapebody.robot.robot import Robot, load_robot, robots
-from shapebody.robot.standing import standing_pose
 
 TOPPLED_TILT = 60.0
 """Degrees from upright beyond which a body counts as toppled."""
@@ -89,8 +89,12 @@ def random_bodies(robot: Robot, designs: int = 200, control_steps: int = 50, see
     physics = NativePhysics(robot, designs)
     ids = np.arange(designs)
     physics.set_designs(ids, bodies)
-    poses = [standing_pose(robot, physics.get_model(i), bodies.nominal[i]) for i in ids]
-    poses = np.stack(poses)
+    poses = np.stack(
+        [
+            standing_pose(physics.get_model(i), robot.pose(bodies.nominal[i]), robot.feet)
+            for i in ids
+        ]
+    )
     low, high = np.moveaxis(bodies.jnt_range[:, robot.joints], -1, 0)
     record = {
         "name": robot.name,

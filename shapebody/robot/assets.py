@@ -15,7 +15,7 @@ from pathlib import Path
 import mujoco
 import numpy as np
 
-from shapebody.robot.leg_ends import has_feet, legs_without_geom
+from shapebody.robot.feet import has_feet, legs_without_geom
 from shapebody.robot.spec_edits import MESHES, carrier, drop_geom, each, listed, unused
 
 _GEOM = mujoco.mjtGeom

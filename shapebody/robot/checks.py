@@ -8,9 +8,9 @@ import mujoco
 import numpy as np
 
 from shapebody.robot.entries import custom_numeric, home_qpos
+from shapebody.robot.feet import ends_without_foot, foot_ids
 from shapebody.robot.finite import check_numbers, is_finite
-from shapebody.robot.geometry import lowest, standing_height
-from shapebody.robot.leg_ends import ends_without_foot, foot_ids
+from shapebody.robot.geometry import lowest, posed, standing_height
 from shapebody.robot.spec_edits import COLLISION_GROUP, each, listed
 
 _JOINT, _OBJ = mujoco.mjtJoint, mujoco.mjtObj
@@ -207,9 +207,7 @@ def check_home(model: mujoco.MjModel) -> Iterator[str]:
     feet, trunk = foot_ids(model), _name(model, _OBJ.mjOBJ_BODY, 1)
     if len(feet) == 0:
         return
-    data = mujoco.MjData(model)
-    data.qpos[:] = home_qpos(model)
-    mujoco.mj_kinematics(model, data)
+    data = posed(model, home_qpos(model))
     height = data.xpos[1, 2] - min(lowest(model, data, foot) for foot in feet)
     if tilt(data.qpos) > MAX_TILT:
         yield (

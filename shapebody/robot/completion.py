@@ -1,10 +1,10 @@
 """What a robot file leaves out and can be inferred from the rest of it.
 
 The method needs more than a simulation model says: which geoms are feet, a nominal pose, one pair
-of gains, an action scale. `complete` adds what is missing to a file's spec, by the functions in
-`STEPS`. Each takes the spec and its compiled model, changes the spec and yields one
-note per change: what was missing, what is assumed, how to say it in the file. A file that needs
-nothing gets no notes and stays as it is.
+of gains, an action scale. `complete` adds what is missing to a file's spec, by the steps in
+`STAGES`. Each takes the spec and its compiled model, changes the spec and yields one note per
+change: what was missing, what is assumed, how to say it in the file. A file that needs nothing gets
+no notes and stays as it is.
 """
 
 from collections.abc import Iterator
@@ -12,10 +12,11 @@ from collections.abc import Iterator
 import mujoco
 import numpy as np
 
-from shapebody.robot.feet import infer_feet, infer_height
-from shapebody.robot.home import infer_home
+from shapebody.robot.entries import custom_numeric
+from shapebody.robot.feet import foot_ids
+from shapebody.robot.foot_completion import infer_feet
+from shapebody.robot.home import infer_height, infer_home
 from shapebody.robot.importing import IMU, VELOCITY_LIMIT
-from shapebody.robot.leg_ends import foot_ids
 from shapebody.robot.servos import infer_actuators
 from shapebody.robot.spec_edits import (
     COLLISION_GROUP,
@@ -36,19 +37,20 @@ from shapebody.robot.spec_edits import (
 _GEOM = mujoco.mjtGeom
 
 
-def complete(spec: mujoco.MjSpec, model: mujoco.MjModel) -> list[str]:
-    """Add to `spec` what the method needs; `model` is its compiled form. Returns the notes.
+def complete(spec: mujoco.MjSpec, model: mujoco.MjModel) -> tuple[list[str], mujoco.MjModel]:
+    """Add to `spec` what the method needs; `model` is its compiled form, before and after.
 
-    The robot must be one floating tree of limited hinge joints (`robots.CHECKS`). What cannot be
-    inferred (feet of a robot without geometry) is left out.
+    Returns the notes and the compiled form of the completed spec. The robot must be one floating
+    tree of limited hinge joints (`shapebody.robot.checks.CHECKS`). What cannot be inferred (feet of
+    a robot without geometry) is left out.
     """
     notes = []
-    for step in STEPS:
-        added = list(step(spec, model))
+    for steps in STAGES:
+        added = [note for step in steps for note in step(spec, model)]
         if added:
             notes += added
             model = spec.compile()
-    return notes
+    return notes, model
 
 
 def infer_options(spec, model) -> Iterator[str]:
@@ -103,10 +105,11 @@ def infer_inertials(spec, model) -> Iterator[str]:
 
 def drop_meshes(spec, model) -> Iterator[str]:
     """Meshes, height fields and image files are dropped; the file then stands by itself."""
-    fitted = [geom for geom in spec.geoms if geom.meshname and geom.type not in MESHES]
-    for geom in fitted:  # primitives whose size the compiler takes from a mesh
-        size, position = model.geom_size[geom.id], model.geom_pos[geom.id]
-        replace_geom(spec, geom, geom.type, size, position, model.geom_quat[geom.id])
+    # Primitives whose size the compiler takes from a mesh. Replacing one changes the ids of others.
+    fitted = [(geom, geom.id) for geom in spec.geoms if geom.meshname and geom.type not in MESHES]
+    for geom, index in fitted:
+        size, position = model.geom_size[index], model.geom_pos[index]
+        replace_geom(spec, geom, geom.type, size, position, model.geom_quat[index])
     meshes = [geom for geom in spec.geoms if geom.type in MESHES]
     bodies = [geom.parent for geom in meshes]
     for geom in meshes:
@@ -206,7 +209,7 @@ def infer_action_scale(spec, model) -> Iterator[str]:
 
     This is exactly the paper's value for 74 % of its 50 robots, and within a factor 2 for 96 %.
     """
-    if _has_numeric(model, "action_scale"):
+    if custom_numeric(model, "action_scale") is not None:
         return
     mass, feet = model.body_mass[1:].sum(), len(foot_ids(model))
     scale = 0.25 if feet == 4 and mass < 25 else 0.75 if feet == 2 and mass > 40 else 0.5
@@ -219,7 +222,7 @@ def infer_action_scale(spec, model) -> Iterator[str]:
 
 def infer_velocity_limits(spec, model) -> Iterator[str]:
     """15 rad/s: within a factor 2 of the median joint for 62 % of the 50 robots."""
-    if _has_numeric(model, "velocity_limits") or model.nu == 0:
+    if custom_numeric(model, "velocity_limits") is not None or model.nu == 0:
         return
     spec.add_numeric(name="velocity_limits", data=[VELOCITY_LIMIT] * model.nu, size=model.nu)
     yield (
@@ -233,7 +236,7 @@ def infer_keep_nominal(spec, model) -> Iterator[str]:
 
     For 47 of the 50 robots of the paper these are exactly the joints that it keeps.
     """
-    if _has_numeric(model, "keep_nominal"):
+    if custom_numeric(model, "keep_nominal") is not None:
         return
     carrying = set()
     for foot in foot_ids(model):
@@ -268,23 +271,13 @@ def drop_tendons(spec, model) -> Iterator[str]:
     )
 
 
-STEPS = (
-    infer_options,
-    infer_inertials,
-    drop_tendons,
-    infer_home,
-    infer_feet,
-    infer_height,
-    infer_actuators,
-    drop_meshes,
-    infer_floor,
-    infer_contacts,
-    infer_imu,
-    infer_action_scale,
-    infer_velocity_limits,
-    infer_keep_nominal,
+# The model is compiled after each stage: no step needs to see what an earlier one of its own stage
+# has changed. Ids of parts of the spec are those of the model only until a part of the tree is
+# added or deleted, so a step that does so is the last of its stage to use them.
+STAGES = (
+    (infer_options, infer_inertials, drop_tendons, infer_home),
+    (infer_feet,),
+    (infer_height, infer_actuators, drop_meshes),
+    (infer_floor,),
+    (infer_contacts, infer_imu, infer_action_scale, infer_velocity_limits, infer_keep_nominal),
 )
-
-
-def _has_numeric(model, name: str) -> bool:
-    return mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_NUMERIC, name) >= 0

@@ -7,10 +7,12 @@ _OBJ = mujoco.mjtObj
 
 
 def home_qpos(model: mujoco.MjModel) -> np.ndarray:
+    """float64[nq], a copy of the positions of "home", which the model must have."""
     return np.array(model.key_qpos[mujoco.mj_name2id(model, _OBJ.mjOBJ_KEY, "home")])
 
 
 def custom_numeric(model: mujoco.MjModel, name: str) -> np.ndarray | None:
+    """float64[n], the numbers of an entry of <custom>; None without an entry of that name."""
     index = mujoco.mj_name2id(model, _OBJ.mjOBJ_NUMERIC, name)
     if index < 0:
         return None
@@ -19,6 +21,7 @@ def custom_numeric(model: mujoco.MjModel, name: str) -> np.ndarray | None:
 
 
 def custom_text(model: mujoco.MjModel, name: str, default: str) -> str:
+    """The text of an entry of <custom>; `default` without an entry of that name."""
     index = mujoco.mj_name2id(model, _OBJ.mjOBJ_TEXT, name)
     if index < 0:
         return default

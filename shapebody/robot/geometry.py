@@ -1,4 +1,4 @@
-"""How far geoms reach, how high a robot stands, how long its legs are."""
+"""Measures of a compiled robot in a pose: how low its geoms reach, how high it stands."""
 
 from __future__ import annotations
 
@@ -9,6 +9,45 @@ _GEOM = mujoco.mjtGeom
 
 
 LEVEL = 0.02  # of the standing height: what differs by less is equally high
+
+SHOWN_GROUPS = (0, 1, 2)
+"""Geom groups in pictures; collision spheres are in group 5."""
+
+
+def posed(model: mujoco.MjModel, qpos) -> mujoco.MjData:
+    """Positions of all parts of a model in the pose `qpos` [nq]."""
+    data = mujoco.MjData(model)
+    data.qpos[:] = qpos
+    mujoco.mj_kinematics(model, data)
+    return data
+
+
+def standing_pose(model: mujoco.MjModel, qpos=None, geoms=None) -> np.ndarray:
+    """float64[nq], a pose with the trunk moved up or down until the robot touches the floor, z = 0.
+
+    A design has other link lengths than the reference, so its own height differs.
+
+    Args:
+        qpos: [nq], the pose; if None, that of the keyframe "home", else of the first keyframe,
+            else `qpos0`.
+        geoms: ids of the geoms whose lowest point comes to z = 0, such as `Robot.feet`; if None,
+            all of the robot that pictures show (`SHOWN_GROUPS`).
+
+    A model that does not start with a free joint stands where its file puts it: its pose is
+    returned as it is.
+    """
+    if qpos is None:
+        home = max(mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_KEY, "home"), 0)
+        qpos = model.key_qpos[home] if model.nkey else model.qpos0
+    qpos = np.array(qpos, np.float64)
+    if not (model.njnt and model.jnt_type[0] == mujoco.mjtJoint.mjJNT_FREE):
+        return qpos
+    if geoms is None:
+        moving = model.body_weldid[model.geom_bodyid] > 0
+        geoms = np.flatnonzero(moving & np.isin(model.geom_group, SHOWN_GROUPS))
+    data = posed(model, qpos)
+    qpos[2] -= min((lowest(model, data, geom) for geom in geoms), default=0.0)
+    return qpos
 
 
 def standing_height(model, data) -> float:
@@ -49,7 +88,7 @@ def reach_of(model, data, geom: int, direction) -> float:
         case _GEOM.mjGEOM_ELLIPSOID:
             return float(np.linalg.norm(size * local))
         case _GEOM.mjGEOM_BOX:
-            return float(size @ np.abs(local))
+            return float(np.sum(size * np.abs(local)))
         case _GEOM.mjGEOM_MESH:
             mesh = model.geom_dataid[geom]
             start, count = model.mesh_vertadr[mesh], model.mesh_vertnum[mesh]

@@ -1,4 +1,4 @@
-"""The nominal pose of a robot file that has none."""
+"""The nominal pose of a robot file that has none, and the height at which it stands in it."""
 
 import re
 from collections.abc import Iterator
@@ -7,12 +7,15 @@ import mujoco
 import numpy as np
 from scipy.optimize import least_squares
 
-from shapebody.robot.geometry import leg_length
-from shapebody.robot.leg_ends import leg_ends
+from shapebody.robot.entries import home_qpos
+from shapebody.robot.feet import foot_ids, leg_ends
+from shapebody.robot.geometry import leg_length, lowest, posed
 from shapebody.robot.spec_edits import listed
 
 _JOINT = mujoco.mjtJoint
 
+
+FLOOR_TOLERANCE = 0.05  # of the home height: how far feet may be from the floor
 
 _STANDING = re.compile("home|stand|nominal|default|init", re.IGNORECASE)
 
@@ -44,6 +47,26 @@ def infer_home(spec, model) -> Iterator[str]:
         spec.delete(key)
     spec.add_key(name="home", qpos=qpos)
     yield f'no keyframe "home": {note}; {hint}'
+
+
+def infer_height(spec, model) -> Iterator[str]:
+    """The trunk in "home" so high that the lowest foot touches the floor."""
+    feet = foot_ids(model)
+    if len(feet) == 0:
+        return
+    qpos = home_qpos(model)
+    data = posed(model, qpos)
+    gap = min(lowest(model, data, foot) for foot in feet)
+    height = data.xpos[1, 2] - gap
+    if abs(gap) <= FLOOR_TOLERANCE * height:
+        return
+    qpos[2] -= gap
+    spec.key("home").qpos = qpos
+    side = "above" if gap > 0 else "below"
+    yield (
+        f'the feet of "home" are {abs(gap):.3f} m {side} the floor: the trunk is moved to z = '
+        f"{qpos[2]:.4f} m; to say it yourself correct the third number of qpos"
+    )
 
 
 def _drawn(model) -> str:

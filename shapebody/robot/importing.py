@@ -13,10 +13,11 @@ import mujoco
 import numpy as np
 
 from shapebody.robot.assets import check_lost, drop_unreadable, find_meshes, parsed_urdf
+from shapebody.robot.feet import sole_beside
 from shapebody.robot.finite import written
 from shapebody.robot.foot_shapes import add_foot, is_tall
+from shapebody.robot.geometry import posed
 from shapebody.robot.guard import admit, require_writable
-from shapebody.robot.leg_ends import sole_beside
 from shapebody.robot.spec_edits import (
     FOOT,
     MESHES,
@@ -353,8 +354,7 @@ def _feet_of_links(spec, fixed) -> Iterator[str]:
     guessed, markers = [], []
     if not all(feet.values()):
         model = spec.compile()
-        data = mujoco.MjData(model)
-        mujoco.mj_kinematics(model, data)
+        data = posed(model, model.qpos0)
         geoms = {geom.id: geom for geom in spec.geoms}
         soles = {}
         for link in (link for link in links.values() if not feet[link.name]):

@@ -12,8 +12,9 @@ import numpy as np
 
 from shapebody.arguments import require_output, require_path
 from shapebody.robot.checks import tilt
-from shapebody.robot.feet import FLOOR_TOLERANCE
-from shapebody.robot.leg_ends import ends_without_foot
+from shapebody.robot.feet import ends_without_foot
+from shapebody.robot.geometry import standing_pose
+from shapebody.robot.home import FLOOR_TOLERANCE
 from shapebody.robot.robot import Robot, examine, find
 from shapebody.robot.servos import leg_torque
 from shapebody.robot.spec_edits import comment, listed
@@ -282,7 +283,7 @@ def warn_plausibility(robot: Robot, held: Held) -> Iterator[str]:
             f"gravity is compensated at bodies {listed(light)}: the legs carry less than their "
             "weight, as on no real robot; remove gravcomp"
         )
-    gap = _gap(robot)
+    gap = float(robot.home[2] - standing_pose(robot.model, robot.home, robot.feet)[2])
     if abs(gap) > FLOOR_TOLERANCE * height:
         yield f'the lowest foot of "home" is {gap:+.3f} m from the floor: correct the trunk height'
     if robot.d_gain == 0:
@@ -295,12 +296,6 @@ def warn_plausibility(robot: Robot, held: Held) -> Iterator[str]:
             "no collision spheres: self-collision is not penalized; add sphere geoms of group 5 "
             'where parts can meet, e.g. <geom type="sphere" size="0.05" group="5"/>'
         )
-
-
-def _gap(robot: Robot) -> float:
-    from shapebody.robot.standing import standing_pose
-
-    return float(robot.home[2] - standing_pose(robot, robot.model, robot.nominal)[2])
 
 
 WARNINGS = (

@@ -2,7 +2,8 @@
 
 A robot file is plain MJCF: one floating body, hinge joints with limits, position actuators, feet
 that touch the floor, an IMU site and a "home" keyframe. What else an MJCF or URDF file lacks is
-inferred from the rest of it (`shapebody.inference`). All arrays of `Robot` are in MuJoCo order.
+inferred from the rest of it (`shapebody.robot.completion`). All arrays of `Robot` are in MuJoCo's
+order.
 """
 
 import difflib
@@ -20,10 +21,10 @@ from shapebody.files import data_dir
 from shapebody.robot.checks import CHECKS, check_feet, check_home, check_masses
 from shapebody.robot.completion import complete
 from shapebody.robot.entries import custom_numeric, custom_text, home_qpos
+from shapebody.robot.feet import foot_ids
 from shapebody.robot.finite import check_inertials, check_text
 from shapebody.robot.importing import read
-from shapebody.robot.leg_ends import foot_ids
-from shapebody.robot.simulation import _add_what_simulates, _slices, _written
+from shapebody.robot.simulation import add_what_simulates, as_text, sensor_slices
 from shapebody.robot.spec_edits import COLLISION_GROUP
 
 _JOINT, _OBJ = mujoco.mjtJoint, mujoco.mjtObj
@@ -122,6 +123,12 @@ class Robot:
         """int[nu], addresses of the actuated joints in qvel."""
         return self.model.jnt_dofadr[self.joints[self.actuated]].astype(int)
 
+    def pose(self, nominal) -> np.ndarray:
+        """float64[nq], the home pose with the actuated joints at `nominal` [nu], rad."""
+        qpos = self.home.copy()
+        qpos[self.qpos_index] = nominal
+        return qpos
+
     @property
     def design_dim(self) -> int:
         """Length d of the design vector, 9 + 13 nb + 11 nj + 3 nu + 3 nf."""
@@ -187,7 +194,7 @@ def find(name_or_path: str | Path) -> Path:
     if not path.is_file():
         raise FileNotFoundError(
             f"robot file {shortened(text)} does not exist (looked at {path.absolute()}): "
-            "give the path of an MJCF or URDF file, or one of the names of shapebody.robot.robot()"
+            "give the path of an MJCF or URDF file, or one of the names of shapebody.robots()"
         )
     return path
 
@@ -198,21 +205,28 @@ def examine(path: Path) -> tuple[Robot | None, list[str], tuple[str, ...]]:
     Raises ValueError for a file that MuJoCo cannot compile.
     """
     text, spec, model, notes = read(path)
+
+    # What cannot be inferred: with a problem here nothing can be completed.
     replaced = list(check_inertials(spec, model))
     checks = [check for check in CHECKS if not (replaced and check is check_masses)]
     problems = replaced + [message for check in checks for message in check(model)]
     problems = problems or list(check_text(text))
     if problems:
         return None, problems, tuple(notes)
-    notes += complete(spec, model)
-    if notes:
-        model = spec.compile()
+
+    # What is missing and can be inferred, and what must hold for the result.
+    added, model = complete(spec, model)
+    notes += added
     problems = [message for check in (*CHECKS, check_feet, check_home) for message in check(model)]
     if problems:
         return None, problems, tuple(notes)
-    # What this adds follows from the rest of the file, so it needs no note.
-    if _add_what_simulates(spec, model) or notes:
-        text, model = _written(spec)
+
+    # What plain MuJoCo needs. It follows from the rest of the file, so it needs no note.
+    changed = add_what_simulates(spec, model)
+    if changed:
+        model = spec.compile()
+    if changed or notes:
+        text, model = as_text(spec, model)
     return _read(path.stem, path, text, model, tuple(notes)), [], tuple(notes)
 
 
@@ -248,6 +262,6 @@ def _read(name: str, path: Path | None, xml: str, model: mujoco.MjModel, inferre
         p_gain=float(model.actuator_gainprm[0, 0]),
         d_gain=0.0 - float(model.actuator_biasprm[0, 2]),
         action_scale=float(custom_numeric(model, "action_scale")[0]),
-        sensors=_slices(model),
+        sensors=sensor_slices(model),
         inferred=inferred,
     )

@@ -5,10 +5,10 @@ from collections.abc import Iterator
 import mujoco
 import numpy as np
 
-from shapebody.robot.feet import _home_id
+from shapebody.robot.entries import home_qpos
+from shapebody.robot.feet import foot_ids
 from shapebody.robot.geometry import leg_length
 from shapebody.robot.importing import ARMATURE
-from shapebody.robot.leg_ends import foot_ids
 from shapebody.robot.spec_edits import listed, ordered
 
 _JOINT, _TRN = mujoco.mjtJoint, mujoco.mjtTrn
@@ -35,15 +35,50 @@ def infer_actuators(spec, model) -> Iterator[str]:
     hinges = np.flatnonzero(model.jnt_type == _JOINT.mjJNT_HINGE)
     if model.nu == 0 and len(hinges) == 0:
         return
-    joints = {joint.id: joint for joint in spec.joints}
-    servos = [_is_servo(model, i) for i in range(model.nu)]
-    gains = np.array([_gains(model, i) for i in range(model.nu) if servos[i]]).reshape(-1, 2)
-    limits = [_torque_limit(model, i) for i in range(model.nu)]
+    servos = np.array([_is_servo(model, i) for i in range(model.nu)], bool)
+    gains = np.array([_gains(model, i) for i in np.flatnonzero(servos)]).reshape(-1, 2)
     driven = model.actuator_trnid[:, 0] if model.nu else hinges
-    fits = (
-        model.nu > 0
-        and all(servos)
-        and len(np.unique(gains, axis=0)) == 1
+    if model.nu and servos.all() and _fits(model, gains):
+        return
+    joints = {joint.id: joint for joint in spec.joints}
+
+    # Which joints are driven, and by what.
+    if model.nu == 0:
+        yield (
+            f"no actuators: one position servo for each of the {len(hinges)} hinge joints; to say "
+            "it yourself add an <actuator> section"
+        )
+        for joint in driven:
+            spec.add_actuator(name=joints[joint].name, target=joints[joint].name)
+    elif not servos.all():
+        others = [_actuator_name(model, i) for i in np.flatnonzero(~servos)]
+        yield (
+            f"actuators {listed(others)} are motors or other drives: replaced by position "
+            "servos, the form of control of the method; to say it yourself use <position>"
+        )
+
+    # One pair of gains, and inertia at the joints where the file does not give it.
+    (p_gain, d_gain), note = _chosen_gains(model, gains)
+    if note:
+        yield note
+    yield from _add_armature(model, joints, driven[~servos] if model.nu else driven)
+
+    # Torque limits of the actuators alone, the same in both directions.
+    limits, note = _chosen_limits(model, driven)
+    if note:
+        yield note
+    yield from _changed_ranges(model, servos, driven)
+
+    for actuator, joint, limit in zip(ordered(spec.actuators), driven, limits, strict=True):
+        _make_servo(actuator, joints[int(joint)], p_gain, d_gain, limit)
+    _hold_home(spec, model, driven)
+
+
+def _fits(model, gains) -> bool:
+    """Whether position servos with these gains [nu, 2] are already as the method has them."""
+    driven = model.actuator_trnid[:, 0]
+    return bool(
+        len(np.unique(gains, axis=0)) == 1
         and np.all(model.actuator_trntype == _TRN.mjTRN_JOINT)
         and np.all(model.actuator_gear[:, 0] == 1)
         and np.all(model.actuator_forcelimited)
@@ -51,49 +86,40 @@ def infer_actuators(spec, model) -> Iterator[str]:
         and not np.any(model.actuator_ctrllimited)
         and not np.any(model.jnt_actfrclimited[driven])
     )
-    if fits:
-        return
-    if model.nu == 0:
-        yield (
-            f"no actuators: one position servo for each of the {len(hinges)} hinge joints; to say "
-            "it yourself add an <actuator> section"
-        )
-        limits = [_joint_limit(model, j) for j in driven]
-        for joint in driven:
-            spec.add_actuator(name=joints[joint].name, target=joints[joint].name)
-    elif not all(servos):
-        others = [_actuator_name(model, i) for i in range(model.nu) if not servos[i]]
-        yield (
-            f"actuators {listed(others)} are motors or other drives: replaced by position "
-            "servos, the form of control of the method; to say it yourself use <position>"
-        )
 
-    (p_gain, d_gain), note = _chosen_gains(model, gains)
-    if note:
-        yield note
-    light = [
-        int(driven[i])
-        for i in range(len(driven))
-        if not (model.nu and servos[i]) and model.dof_armature[model.jnt_dofadr[driven[i]]] == 0
-    ]
+
+def _add_armature(model, joints, drives) -> Iterator[str]:
+    """Armature of the joints `drives` that have none; `joints` are those of the spec by ids."""
+    light = [int(joint) for joint in drives if model.dof_armature[model.jnt_dofadr[joint]] == 0]
+    for joint in light:
+        joints[joint].armature = ARMATURE
     if light:
-        for joint in light:
-            joints[joint].armature = ARMATURE
         yield (
             f"no armature of joints {listed(model.joint(j).name for j in light)}: {ARMATURE:g} kg "
             "m², the inertia of a motor as the joint feels it; to say it yourself add "
             f'armature="{ARMATURE:g}" to the joints'
         )
 
+
+def _chosen_limits(model, driven) -> tuple[list[float], str]:
+    """Torque limit of each driven joint, N m, and a note if the file lacks some."""
+    if model.nu:
+        limits = [_torque_limit(model, i) for i in range(model.nu)]
+    else:
+        limits = [_joint_limit(model, joint) for joint in driven]
     missing = [int(driven[i]) for i, limit in enumerate(limits) if limit is None]
-    if missing:
-        guess = float(f"{leg_torque(model):.3g}")
-        names = [model.joint(j).name for j in missing]
-        yield (
-            f"no torque limits of joints {listed(names)}: {guess:g} N m, the weight on one foot "
-            "times the length of a leg; to say it yourself add forcerange to the actuators"
-        )
-        limits = [guess if limit is None else limit for limit in limits]
+    if not missing:
+        return limits, ""
+    guess = float(f"{leg_torque(model):.3g}")
+    names = [model.joint(j).name for j in missing]
+    return [guess if limit is None else limit for limit in limits], (
+        f"no torque limits of joints {listed(names)}: {guess:g} N m, the weight on one foot times "
+        "the length of a leg; to say it yourself add forcerange to the actuators"
+    )
+
+
+def _changed_ranges(model, servos, driven) -> Iterator[str]:
+    """What becomes of the control ranges, gears and torque limits of a file, for its notes."""
     if np.any(model.actuator_ctrllimited[servos]):
         yield "control ranges of the actuators are removed: joint limits and torque limits remain"
     geared = [i for i in range(model.nu) if model.actuator_gear[i, 0] != 1]
@@ -114,14 +140,14 @@ def infer_actuators(spec, model) -> Iterator[str]:
     if np.any(model.jnt_actfrclimited[driven]):
         yield "torque limits of the joints (actuatorfrcrange, effort) are moved to the actuators"
 
-    for actuator, joint, limit in zip(ordered(spec.actuators), driven, limits, strict=True):
-        _make_servo(actuator, joints[int(joint)], p_gain, d_gain, limit)
-    home = np.array(model.key_qpos[_home_id(model)])
+
+def _hold_home(spec, model, driven):
+    """Leave "home" as the only keyframe, with its joint positions as the targets of the servos."""
     for key in [key for key in spec.keys if key.name != "home"]:
         spec.delete(key)
     key = spec.key("home")
     key.act = []
-    key.ctrl = home[model.jnt_qposadr[driven]]
+    key.ctrl = home_qpos(model)[model.jnt_qposadr[driven]]
 
 
 def _chosen_gains(model, gains) -> tuple[tuple[float, float], str]:

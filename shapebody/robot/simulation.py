@@ -4,7 +4,7 @@ import mujoco
 import numpy as np
 
 from shapebody.robot.entries import home_qpos
-from shapebody.robot.leg_ends import foot_ids
+from shapebody.robot.feet import foot_ids
 from shapebody.robot.spec_edits import COLLISION_GROUP, keep_inertias_writable
 
 _OBJ, _SENSOR = mujoco.mjtObj, mujoco.mjtSensor
@@ -36,7 +36,7 @@ def _layout(model: mujoco.MjModel) -> dict[str, list[tuple]]:
     return blocks
 
 
-def _slices(model: mujoco.MjModel) -> dict[str, slice] | None:
+def sensor_slices(model: mujoco.MjModel) -> dict[str, slice] | None:
     """Slice of sensordata of each block, or None if a block is missing or out of order."""
     slices = {}
     for block, sensors in _layout(model).items():
@@ -57,7 +57,7 @@ def _slices(model: mujoco.MjModel) -> dict[str, slice] | None:
     return slices
 
 
-def _add_what_simulates(spec: mujoco.MjSpec, model: mujoco.MjModel) -> bool:
+def add_what_simulates(spec: mujoco.MjSpec, model: mujoco.MjModel) -> bool:
     """Add to `spec` the missing sensors and foot-floor pairs, and let "home" be a state at rest
     whose targets are its joint positions; says whether anything was changed.
 
@@ -67,7 +67,7 @@ def _add_what_simulates(spec: mujoco.MjSpec, model: mujoco.MjModel) -> bool:
 
 
 def _add_sensors(spec: mujoco.MjSpec, model: mujoco.MjModel) -> bool:
-    if _slices(model) is not None:
+    if sensor_slices(model) is not None:
         return False
     blocks = _layout(model)
     ours = {sensor[0] for sensors in blocks.values() for sensor in sensors}
@@ -106,8 +106,11 @@ def _rest_home(spec: mujoco.MjSpec, model: mujoco.MjModel) -> bool:
     return True
 
 
-def _written(spec: mujoco.MjSpec) -> tuple[str, mujoco.MjModel]:
-    """Text of `spec`, and the model that this text compiles to, to the last digit."""
-    keep_inertias_writable(spec, spec.compile())
+def as_text(spec: mujoco.MjSpec, model: mujoco.MjModel) -> tuple[str, mujoco.MjModel]:
+    """Text of `spec`, and the model that this text compiles to, to the last digit.
+
+    `model` is the compiled form of `spec`.
+    """
+    keep_inertias_writable(spec, model)
     text = spec.to_xml()
     return text, mujoco.MjModel.from_xml_string(text)

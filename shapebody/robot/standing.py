@@ -6,8 +6,8 @@ from dataclasses import dataclass
 import mujoco
 import numpy as np
 
-from shapebody.robot.geometry import lowest
-from shapebody.robot.robot import FOOT_BOX, Robot
+from shapebody.robot.geometry import lowest, posed
+from shapebody.robot.robot import Robot
 from shapebody.robot.servos import GAIN_PER_MASS, GAIN_RATIO
 from shapebody.robot.spec_edits import listed
 
@@ -50,7 +50,7 @@ def hold(robot: Robot, seconds: float = 1.0) -> Held:
     mujoco.mj_forward(model, data)
     height = max(data.xpos[robot.trunk, 2], 1e-3)
     up = data.xmat[robot.trunk].reshape(3, 3)[2].copy()
-    lowest, angle = height, 0.0
+    least, angle = height, 0.0
     touching = np.zeros(robot.num_feet, bool)
     saturated = np.zeros(robot.num_actuators)
     reversing = np.zeros(robot.num_actuators)
@@ -66,7 +66,7 @@ def hold(robot: Robot, seconds: float = 1.0) -> Held:
         if not finite:
             break
         done += 1
-        lowest = min(lowest, data.xpos[robot.trunk, 2])
+        least = min(least, data.xpos[robot.trunk, 2])
         cosine = data.xmat[robot.trunk].reshape(3, 3)[2] @ up
         angle = max(angle, float(np.arccos(np.clip(cosine, -1, 1))))
         geoms = data.contact.geom[: data.ncon].ravel()
@@ -77,7 +77,7 @@ def hold(robot: Robot, seconds: float = 1.0) -> Held:
         before = share
     done = max(1, done)
     return Held(
-        finite, float(1 - lowest / height), angle, touching, saturated / done, reversing / done
+        finite, float(1 - least / height), angle, touching, saturated / done, reversing / done
     )
 
 
@@ -105,9 +105,7 @@ def leg_drop(robot: Robot) -> float:
 
     From the first joint of a leg to the lowest point of its foot; of the leg that reaches furthest.
     """
-    model, data = robot.model, mujoco.MjData(robot.model)
-    data.qpos[:] = robot.home
-    mujoco.mj_kinematics(model, data)
+    model, data = robot.model, posed(robot.model, robot.home)
     shares = []
     for foot, body in zip(robot.feet, robot.foot_bodies, strict=True):
         length = np.linalg.norm(model.geom_pos[foot])
@@ -229,18 +227,3 @@ def warn_gains(robot: Robot, held: Held) -> Iterator[str]:
             f'kp="{usual:.0f}" kv="{d_gain:.2g}" in every <position>, with armature of '
             f"{needed:.2g} kg m² or more"
         )
-
-
-def standing_pose(robot: Robot, model: mujoco.MjModel, nominal) -> np.ndarray:
-    """qpos [nq]: the home pose with actuated joints at `nominal` [nu] and the lowest point of the
-    feet of `model` at z = 0."""
-    data = mujoco.MjData(model)
-    data.qpos[:] = robot.home
-    data.qpos[robot.qpos_index] = nominal
-    mujoco.mj_kinematics(model, data)
-    vertical = np.abs(data.geom_xmat[robot.feet].reshape(-1, 3, 3)[:, 2])
-    size = model.geom_size[robot.feet]
-    reach = np.where(robot.foot_types == FOOT_BOX, np.sum(vertical * size, axis=1), size[:, 0])
-    pose = data.qpos.copy()
-    pose[2] -= np.min(data.geom_xpos[robot.feet, 2] - reach)
-    return pose

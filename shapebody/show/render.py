@@ -13,11 +13,9 @@ from shapebody.arguments import (
     require_integer,
     require_number,
 )
+from shapebody.robot.geometry import SHOWN_GROUPS, standing_pose
 from shapebody.show import software_renderer
 from shapebody.show.opengl import _NO_OPENGL, _say, find_opengl
-
-SHOWN_GROUPS = (0, 1, 2)
-"""Geom groups in pictures; collision spheres are in group 5."""
 
 
 class Renderer:
@@ -218,45 +216,6 @@ def _check_qpos(model, qpos, ndim):
     if not np.isfinite(qpos).all():
         raise ValueError("qpos holds values that are not finite; cut the trajectory before them")
     return qpos
-
-
-def standing_pose(model: mujoco.MjModel) -> np.ndarray:
-    """float64[nq], the keyframe "home", moved up or down until the robot touches z = 0.
-
-    Without one of that name it is the first keyframe, and without any keyframe qpos0. A design has
-    other link lengths than the reference, so its own height differs.
-    """
-    model = _model_of(model)
-    home = max(mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_KEY, "home"), 0)
-    qpos = (model.key_qpos[home] if model.nkey else model.qpos0).copy()
-    if not (model.njnt and model.jnt_type[0] == mujoco.mjtJoint.mjJNT_FREE):
-        return qpos
-    data = mujoco.MjData(model)
-    data.qpos[:] = qpos
-    mujoco.mj_kinematics(model, data)
-    solid = np.isin(model.geom_group, SHOWN_GROUPS)
-    lowest = [_lowest_point(model, data, geom) for geom in np.flatnonzero(solid)]
-    qpos[2] -= min((z for z in lowest if z is not None), default=0.0)
-    return qpos
-
-
-def _lowest_point(model, data, geom):
-    kind, size = model.geom_type[geom], model.geom_size[geom]
-    types = mujoco.mjtGeom
-    down = data.geom_xmat[geom].reshape(3, 3)[2]
-    if kind == types.mjGEOM_SPHERE:
-        reach = size[0]
-    elif kind == types.mjGEOM_CAPSULE:
-        reach = size[0] + size[1] * abs(down[2])
-    elif kind == types.mjGEOM_CYLINDER:
-        reach = size[0] * np.hypot(down[0], down[1]) + size[1] * abs(down[2])
-    elif kind == types.mjGEOM_ELLIPSOID:
-        reach = np.linalg.norm(size * down)
-    elif kind == types.mjGEOM_BOX:
-        reach = np.abs(size * down).sum()
-    else:
-        return None
-    return data.geom_xpos[geom, 2] - reach
 
 
 def render_frame(body, qpos=None, *, height=360, width=480, spheres=False, **camera) -> np.ndarray:

@@ -28,6 +28,7 @@ from shapebody.arguments import (
 )
 from shapebody.design.space import DesignSpace
 from shapebody.files import atomic_write
+from shapebody.robot.geometry import SHOWN_GROUPS, standing_pose
 from shapebody.show import render, software_renderer
 
 _ROOT = "/robot"
@@ -125,7 +126,7 @@ def show_design(robot_or_space, f=None, qpos=None, spheres: bool = False, height
     model = _model(robot_or_space, f)
     require_integer("height", height, 16, 8192)
     parts = _parts(model, require_flag("spheres", spheres))
-    pose = render.standing_pose(model) if qpos is None else render._check_qpos(model, qpos, 1)
+    pose = standing_pose(model) if qpos is None else render._check_qpos(model, qpos, 1)
     commands = [_add(part) for part in parts]
     commands += [_place(part, transform) for part, transform in _transforms(parts, model, pose)]
     return Scene([*_surroundings(model, pose), *commands], height)
@@ -149,7 +150,7 @@ def animate_designs(space, trajectory, seconds: float = 4.0, frames: int = 60, h
     space.validate(trajectory)
     rows = np.unique(np.linspace(0, len(trajectory) - 1, frames).round().astype(int))
     models = [space.to_model(f) for f in trajectory[rows]]
-    poses = [render.standing_pose(model) for model in models]
+    poses = [standing_pose(model) for model in models]
     parts = _parts(models[0], spheres=False)
     every = [
         [transform for _, transform in _transforms(parts, model, pose)]
@@ -214,7 +215,7 @@ class LiveScene:
             for part in self._parts:
                 material = geometry.MeshLambertMaterial(color=part.colour, opacity=part.opacity)
                 self.viewer[part.path].set_object(shapes[part.shape](), material)
-        for part, transform in _transforms(self._parts, model, render.standing_pose(model)):
+        for part, transform in _transforms(self._parts, model, standing_pose(model)):
             self.viewer[part.path].set_transform(_matrix(*transform))
 
 
@@ -264,7 +265,7 @@ def _model(robot_or_space, f):
 
 
 def _parts(model, spheres):
-    groups = (*render.SHOWN_GROUPS, 5) if spheres else render.SHOWN_GROUPS
+    groups = (*SHOWN_GROUPS, 5) if spheres else SHOWN_GROUPS
     kinds = mujoco.mjtGeom
     shapes = {
         int(kinds.mjGEOM_BOX): [("", "BoxGeometry")],

@@ -25,6 +25,7 @@ from shapebody.arguments import (
     require_text,
 )
 from shapebody.files import atomic_write
+from shapebody.robot.geometry import standing_pose
 from shapebody.show.opengl import _say
 from shapebody.show.render import (
     Renderer,
@@ -32,7 +33,6 @@ from shapebody.show.render import (
     _model_of,
     _require_camera,
     require_size,
-    standing_pose,
 )
 
 _NO_FFMPEG = (
