@@ -274,6 +274,19 @@ def test_meshes(tmp_path, inertial, mesh, message):
         np.testing.assert_allclose(robot.model.body_mass, mass, rtol=1e-5)
 
 
+def test_primitives_with_the_size_of_a_mesh_keep_it(tmp_path):
+    """Also when there are several in one body."""
+    fitted = "".join(
+        f'<geom name="fit_{shape}" type="{shape}" mesh="hip" class="visual" fitscale="{scale}"/>'
+        for shape, scale in (("box", 0.5), ("sphere", 0.7), ("capsule", 0.9))
+    )
+    path = quadruped(tmp_path, inertial=INERTIAL + fitted)
+    file, robot = mujoco.MjModel.from_xml_path(str(path)), load_robot(path).model
+    for name in ("fit_box", "fit_sphere", "fit_capsule"):
+        np.testing.assert_allclose(robot.geom(name).size, file.geom(name).size, rtol=1e-5)
+        np.testing.assert_allclose(robot.geom(name).pos, file.geom(name).pos, atol=1e-6)
+
+
 FEET = {
     "capsule": (
         '<geom class="collision" type="capsule" size="0.02 0.05" pos="0 0 -0.15"/>',

@@ -162,10 +162,10 @@ def _drop_meshes(spec, names: dict[str, tuple[str, str]]) -> Iterator[Lost]:
 
 
 def drop_unreadable(spec, kind: str, notes: list[str]) -> list[Lost]:
-    """Drop from a spec that does not compile each mesh, image and visual that is to blame.
+    """Drop from a spec that does not compile every mesh, image and visual that prevents it.
 
-    Each is compiled alone. `kind` is what the file calls a body ("link" or "body"). Geoms that
-    collide stay, and get names by which the compiler's message can be understood.
+    To find them, each is compiled alone. `kind` is what the file calls a body ("link" or "body").
+    Geoms that collide stay, and get names so that the compiler's message can be understood.
     """
     lost = []
     for skin in list(spec.skins):
@@ -305,10 +305,10 @@ def check_lost(path: Path, model, lost: list[Lost], kind: str):
 
 
 def _mend_visuals(root, notes: list[str]) -> bool:
-    """Take out of a URDF what MuJoCo cannot parse and only looks depend on; says whether any.
+    """Take out of a URDF what MuJoCo cannot parse and only looks depend on.
 
-    Of several materials of a visual the first counts, one that cannot be parsed goes, and so does
-    a visual that cannot be parsed.
+    Of several materials of a visual the first counts. Materials and visuals that cannot be parsed
+    are removed. Returns whether anything was changed.
     """
     several, colours, dropped = [], [], {}
     for material in root.findall("material"):

@@ -1,6 +1,7 @@
 """Checks of a compiled robot file. Each yields one message per problem: what, expected, fix.
 
-They judge what cannot be inferred; what is merely missing is no problem."""
+They judge what cannot be inferred. What is only missing is added by `shapebody.robot.completion`.
+"""
 
 from collections.abc import Callable, Iterator
 
@@ -85,9 +86,9 @@ def check_joints(model: mujoco.MjModel) -> Iterator[str]:
             )
         else:
             yield (
-                f'{each("joint", names)} has range="{finding}", which is no limit: expected lower '
-                '< upper and no limited="false"; correct the range (in a URDF, lower and upper of '
-                "<limit>)"
+                f'{each("joint", names)} has range="{finding}", which sets no limits: expected '
+                'lower < upper and no limited="false"; correct the range (in a URDF, lower and '
+                "upper of <limit>)"
             )
 
 
@@ -101,7 +102,7 @@ def check_masses(model: mujoco.MjModel) -> Iterator[str]:
         mass = model.body_mass[moving == body].sum()
         inertia = model.body_inertia[moving == body].max(axis=0).min()
         if not (mass >= MIN_MASS and inertia >= MIN_INERTIA):
-            # What is below 1e-9 is what `read` put in place of nothing.
+            # Values below 1e-9 were put by `read` in place of missing ones.
             shown = f"{mass if mass > 1e-9 else 0:g} kg and {inertia if inertia > 1e-13 else 0:g}"
             found.setdefault(shown, []).append(_name(model, _OBJ.mjOBJ_BODY, body))
     for shown, names in found.items():
@@ -173,7 +174,7 @@ def check_actuators(model: mujoco.MjModel) -> Iterator[str]:
 
 
 def check_feet(model: mujoco.MjModel) -> Iterator[str]:
-    """Feet at the ends of legs. Asked of the completed model."""
+    """Feet at the ends of legs. For the completed model."""
     feet = foot_ids(model)
     fixed = [foot for foot in feet if model.body_weldid[model.geom_bodyid[foot]] == 1]
     if fixed:
@@ -191,8 +192,8 @@ def check_feet(model: mujoco.MjModel) -> Iterator[str]:
     if both:
         names = [_name(model, _OBJ.mjOBJ_GEOM, foot) for foot in both]
         yield (
-            f"{each('geom', names)} is a foot and a collision sphere of group {COLLISION_GROUP}: "
-            "expected one or the other; use another group for the foot"
+            f"{each('geom', names)} is both a foot and a collision sphere of group "
+            f"{COLLISION_GROUP}: expected one or the other; use another group for the foot"
         )
     if len(feet) == 0:
         yield (
@@ -203,7 +204,7 @@ def check_feet(model: mujoco.MjModel) -> Iterator[str]:
 
 
 def check_home(model: mujoco.MjModel) -> Iterator[str]:
-    """A trunk with z up, above the feet, in "home". Asked of the completed model."""
+    """A trunk with z up, above the feet, in "home". For the completed model."""
     feet, trunk = foot_ids(model), _name(model, _OBJ.mjOBJ_BODY, 1)
     if len(feet) == 0:
         return
@@ -230,7 +231,7 @@ def check_home(model: mujoco.MjModel) -> Iterator[str]:
 
 
 def check_poses(model: mujoco.MjModel) -> Iterator[str]:
-    """Positions of keyframes that a robot can have: larger ones leave no digits for the feet."""
+    """Keyframes near the origin: with larger numbers no digits are left for the feet."""
     for key, qpos in enumerate(model.key_qpos):
         far = np.flatnonzero((np.abs(qpos) > FAR) & is_finite(qpos))
         if len(far):
@@ -248,7 +249,7 @@ def tilt(qpos) -> float:
 
 
 def check_ranges(model: mujoco.MjModel) -> Iterator[str]:
-    """Ranges of torques that a motor can have: both directions, or at least none in between."""
+    """Torque ranges that a motor can have: they contain 0 and reach above it."""
     ranges = [
         ("forcerange", _OBJ.mjOBJ_ACTUATOR, i, model.actuator_forcerange[i])
         for i in range(model.nu)

@@ -1,4 +1,4 @@
-"""Where a robot touches the floor: its feet, the ends of its legs, and what only looks so."""
+"""Where a robot touches the floor: feet, ends of legs, and tails that only look like legs."""
 
 import mujoco
 import numpy as np
@@ -32,7 +32,7 @@ def foot_name(geoms, group) -> str:
 
 
 def solid(model, group) -> list[int]:
-    """The geoms of a group that are not meshes; all of them if it has only meshes."""
+    """The geoms of a group that are not meshes, or all of them if it only has meshes."""
     return [i for i in group if model.geom_type[i] not in MESHES] or group
 
 
@@ -149,8 +149,8 @@ def _carry(model, data, ends, tolerance: float) -> bool:
 def legs_without_geom(model) -> list[int]:
     """Outermost bodies without any geom that are as low as bodies with feet, or as ends of legs.
 
-    Asked before the robot is complete: the pose is "home" if there is one, else the zero pose
-    within the joint limits. If no leg has an end, all such bodies count.
+    For robots that are not complete yet: the pose is "home" if there is one, else the zero pose
+    within the joint limits. If no leg ends in a geom, all such bodies count.
     """
     moving, qpos = model.body_weldid, _rest(model)
     filled = set(moving[model.geom_bodyid].tolist())
@@ -164,7 +164,7 @@ def legs_without_geom(model) -> list[int]:
 
 
 def has_feet(model) -> bool:
-    """Whether there are feet, or legs that end in geoms. Asked before the robot is complete."""
+    """Whether there are feet, or legs that end in geoms. For robots that are not complete yet."""
     return bool(_footed(model) or leg_ends(model, _rest(model)))
 
 
@@ -187,8 +187,8 @@ def _footed(model) -> set[int]:
 def sole_beside(model, data, body: int, height: float) -> list[int]:
     """The lowest colliding geoms of the leg of a body, if they reach down to a height, m.
 
-    The leg is the body, what it carries, and what carries it up to a fork or the trunk. Empty if
-    nothing of it collides so low.
+    The leg is the body, what it carries, and what carries it up to a fork or the trunk. The list is
+    empty if no part of the leg collides that low.
     """
     moving = model.body_weldid
     above = {int(b): int(moving[model.body_parentid[b]]) for b in np.unique(moving) if b}

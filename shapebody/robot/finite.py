@@ -1,7 +1,7 @@
-"""Numbers of a robot file that cannot be simulated: not finite, or none in float32.
+"""Numbers of a robot file that are not finite, also those that are too large for float32.
 
-MuJoCo computes in float64 and reads "nan", "inf" and 1e39 without a word; MJX and the networks
-compute in float32, where all of them end every simulation.
+MuJoCo computes in float64 and accepts "nan", "inf" and 1e39 silently; MJX and the networks compute
+in float32, where each of them ruins every simulation.
 """
 
 import re
@@ -56,7 +56,7 @@ def is_finite(values) -> np.ndarray:
 
 
 def check_numbers(model: mujoco.MjModel) -> Iterator[str]:
-    """Finite numbers in all fields, and none below zero where that means nothing."""
+    """Finite numbers in all fields, and none below zero where negative ones make no sense."""
     fields = [name for name in dir(model) if _is_floats(getattr(model, name, None))]
     found = [
         message
@@ -86,7 +86,7 @@ def check_numbers(model: mujoco.MjModel) -> Iterator[str]:
 
 
 def check_inertials(spec: mujoco.MjSpec, model: mujoco.MjModel) -> Iterator[str]:
-    """Masses and inertias of the file that mean nothing and that compiling has replaced."""
+    """Masses and inertias of the file that make no sense, and that compiling has replaced."""
     found: dict[str, list[str]] = {}
     for body in spec.bodies[1:]:
         if not body.explicitinertial:
@@ -134,7 +134,7 @@ def _not_finite_in(model, field: str) -> Iterator[str]:
 
 
 def _owner(model, field: str, rows: int) -> Callable[[int], str] | None:
-    """What gives the name of a row of a field; None if its rows belong to no named element."""
+    """The function that names a row of a field; None if its rows have no elements with names."""
 
     def named(kind):
         return lambda i: repr(mujoco.mj_id2name(model, kind, int(i)) or _unnamed(model, kind, i))
@@ -150,7 +150,7 @@ def _owner(model, field: str, rows: int) -> Callable[[int], str] | None:
 
 
 def _unnamed(model, kind, index: int) -> str:
-    """What an element without a name is called: its number, and for a geom its body."""
+    """What to call an element without a name: its number, and for a geom its body."""
     if kind != _OBJ.mjOBJ_GEOM:
         return f"number {index}"
     body = mujoco.mj_id2name(model, _OBJ.mjOBJ_BODY, int(model.geom_bodyid[index]))
@@ -186,14 +186,14 @@ def check_text(text: str) -> Iterator[str]:
         root = ElementTree.fromstring(text)
     except ElementTree.ParseError:
         return
-    for finding in written(root):
+    for finding in not_finite(root):
         yield f"{finding}: expected {_EXPECTED}; correct it"
 
 
-def written(root: ElementTree.Element) -> list[str]:
-    """The attributes in an XML tree with numbers that are not finite, as their reader sees them.
+def not_finite(root: ElementTree.Element) -> list[str]:
+    """The attributes in an XML tree with numbers that are not finite, in the words of the file.
 
-    Names of elements are no numbers, whatever they are.
+    The name of an element is not read as a number, even if it looks like one.
     """
     names = {element.get("name") for element in root.iter()}
     found: dict[str, list[str]] = {}
@@ -231,7 +231,7 @@ def _numbers(text: str) -> Iterator[float]:
 
 
 def _shown(values, is_wrong: Callable | None = None) -> str:
-    """Numbers for a message; of many, those that are wrong and where they are."""
+    """Numbers for a message; of many, only the wrong ones with their places."""
     values = np.asarray(values)
     if values.size > 6 and is_wrong is not None:
         places = np.flatnonzero(is_wrong(values))

@@ -58,19 +58,7 @@ def infer_feet(spec, model) -> Iterator[str]:
         _make_foot(spec, geoms, model, data, group, labels[group[0]], group[0] in ready)
         for group in groups
     )
-    if marked:
-        yield (
-            f"geoms {listed(marked)} touch nothing, and beside them other geoms of the same legs "
-            f'do: these are the feet: {made}; to say it yourself put "foot" into the names of the '
-            "geoms that touch the floor alone"
-        )
-    elif named:
-        yield f"feet must be one sphere or box each: {made}; to say it yourself replace the geoms"
-    else:
-        yield (
-            f'no geom has "foot" in its name: the lowest geoms of the legs are the feet: {made}; '
-            'to say it yourself name the geoms that touch the floor, e.g. name="left_foot"'
-        )
+    yield _why(made, named, marked)
     if tails:
         yield (
             f"{each('body', [model.body(body).name for body in tails])} reaches the floor too, but "
@@ -78,6 +66,22 @@ def infer_feet(spec, model) -> Iterator[str]:
             'weight, and passes through the floor; to make it a foot put "foot" into the names of '
             "all geoms that touch the floor"
         )
+
+
+def _why(made: str, named, marked) -> str:
+    """The note about the feet `made`: what was wrong with the geoms that are named as feet."""
+    if marked:
+        return (
+            f"geoms {listed(marked)} touch nothing, and beside them other geoms of the same legs "
+            f'do: these are the feet: {made}; to say it yourself put "foot" only into the names '
+            "of the geoms that touch the floor"
+        )
+    if named:
+        return f"feet must be one sphere or box each: {made}; to say it yourself replace the geoms"
+    return (
+        f'no geom has "foot" in its name: the lowest geoms of the legs are the feet: {made}; to '
+        'say it yourself name the geoms that touch the floor, e.g. name="left_foot"'
+    )
 
 
 def _named_feet(model, data, geoms, named):

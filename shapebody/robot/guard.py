@@ -79,7 +79,7 @@ class _Reader:
     """Reads robot files in another process, which is started when needed and replaced when lost."""
 
     def __init__(self):
-        self.inside = False  # whether this is the other process
+        self.inside = False  # True in the other process
         self.forget()
         atexit.register(self.stop)
         if hasattr(os, "register_at_fork"):
@@ -194,7 +194,7 @@ def serve() -> None:
     """Answer requests from standard input until it ends: the other process."""
     _reader.inside = True
     answers = os.fdopen(os.dup(1), "wb")
-    os.dup2(2, 1)  # what MuJoCo prints is no answer
+    os.dup2(2, 1)  # what MuJoCo prints is not an answer
     from shapebody.robot.importing import read
 
     _limit_memory()

@@ -14,7 +14,7 @@ import numpy as np
 
 from shapebody.robot.assets import check_lost, drop_unreadable, find_meshes, parsed_urdf
 from shapebody.robot.feet import sole_beside
-from shapebody.robot.finite import written
+from shapebody.robot.finite import not_finite
 from shapebody.robot.foot_shapes import add_foot, is_tall
 from shapebody.robot.geometry import posed
 from shapebody.robot.guard import admit, require_writable
@@ -29,9 +29,7 @@ from shapebody.robot.spec_edits import (
     ordered,
     unused,
 )
-from shapebody.robot.urdf import check_urdf, drop_endless_visuals, limits_of
-from shapebody.robot.urdf import end as _end
-from shapebody.robot.urdf import number as _number
+from shapebody.robot.urdf import as_number, check_urdf, drop_endless_visuals, limits_of, link_of
 
 _GEOM, _JOINT = mujoco.mjtGeom, mujoco.mjtJoint
 
@@ -44,8 +42,8 @@ IMU = re.compile("imu", re.IGNORECASE)
 def read(path: Path) -> tuple[str, mujoco.MjSpec, mujoco.MjModel, list[str]]:
     """Text, spec, compiled model and first notes of an MJCF or URDF file.
 
-    Raises ValueError, naming the fix, for a file that is no text, empty, cut off or not valid, and
-    for one that MuJoCo should not be given (`shapebody.robot.guard`).
+    Raises ValueError, naming the fix, for a file that is not text, is empty, cut off or not valid,
+    and for one that MuJoCo should not be given (`shapebody.robot.guard`).
     """
     admit(path)
     try:
@@ -70,6 +68,8 @@ def read(path: Path) -> tuple[str, mujoco.MjSpec, mujoco.MjModel, list[str]]:
     if urdf:
         notes.append("the file is a URDF: it is imported by MuJoCo and completed as MJCF")
         text = _prepared_urdf(path, shown, notes)
+
+    # To a spec that compiles, without the meshes that cannot be read.
     try:
         if urdf:
             spec = _import_urdf(path, text, notes, lost)
@@ -85,11 +85,13 @@ def read(path: Path) -> tuple[str, mujoco.MjSpec, mujoco.MjModel, list[str]]:
             lost += drop_unreadable(spec, "link" if urdf else "body", notes)
             model = _compile(spec, notes)
         if urdf:
-            model = _float(spec, model, text, notes)
+            model = _float(spec, text, notes)
     except ValueError as error:
         kind = "URDF" if urdf else "MJCF"
         reason = _explained(error, kind, text)
         raise ValueError(f"{path} is not a valid {kind} file: {reason}") from error
+
+    # What compiles and still cannot be used: too much to write, or legs that have lost their ends.
     require_writable(path, model)
     check_lost(path, model, lost, "link" if urdf else "body")
     if re.search(r"<include\s", shown):
@@ -103,8 +105,8 @@ _FIXES = {
     "qpos size": "give each keyframe as many numbers as the robot has positions (7 for the free "
     "joint, then 1 per hinge); if it has them, the trunk lacks its <freejoint/>",
     "balanceinertia": 'correct the inertia, or let <compiler balanceinertia="true"/> repair it',
-    "positive eigenvalues": "an inertia must be positive definite: no body has one that is not; "
-    "correct the numbers, e.g. by those of a box of the same mass and size",
+    "positive eigenvalues": "an inertia must be positive definite; correct the numbers, e.g. to "
+    "those of a box of the same mass and size",
     "opening file": "put the included file where the text says; a file that includes others must "
     "have a name that ends in '.xml'",
     "model type": "expected <mujoco> (MJCF) or <robot> (URDF) as the first element: this is "
@@ -133,7 +135,7 @@ def _explained(error: Exception, kind: str, text: str) -> str:
     fixes = {**_FIXES, "top level": _TOP_LEVEL[kind]}
     fix = next((fix for part, fix in fixes.items() if part in reason), default)
     root = _urdf_root(text)
-    wrong = [] if root is None else written(root)
+    wrong = [] if root is None else not_finite(root)
     if "bad format" in reason and re.search(r"\$[({]", text):
         fix = "this is part of a xacro template: expand it with 'xacro FILE > robot.urdf'"
     if wrong:
@@ -189,9 +191,9 @@ def _prepared_urdf(path: Path, text: str, notes) -> str:
     notes += changes + check_urdf(path, root)
     dropped = []
     while (link := _empty_root(root)) is not None:
-        (joint,) = [joint for joint in root.findall("joint") if _end(joint, "parent") == link]
+        (joint,) = [joint for joint in root.findall("joint") if link_of(joint, "parent") == link]
         dropped.append(link)
-        base = _end(joint, "child")
+        base = link_of(joint, "child")
         for element in root.findall("link"):
             if element.get("name") == link:
                 root.remove(element)
@@ -207,7 +209,7 @@ def _prepared_urdf(path: Path, text: str, notes) -> str:
 
 
 def _urdf_root(text: str):
-    """Root element of a URDF; None if MuJoCo's more lenient parser has to read it alone."""
+    """Root element of a URDF; None if only MuJoCo's more lenient parser may be able to read it."""
     try:
         root = ElementTree.fromstring(text)
     except ElementTree.ParseError:
@@ -222,23 +224,23 @@ def _empty_root(root) -> str | None:
     """Name of the root link if it is only a frame: no mass, no geometry, one child that is fixed
     to it or floats."""
     joints = root.findall("joint")
-    children = {_end(joint, "child") for joint in joints}
+    children = {link_of(joint, "child") for joint in joints}
     tops = [link for link in root.findall("link") if link.get("name") not in children]
     if len(tops) != 1:
         return None
-    below = [joint for joint in joints if _end(joint, "parent") == tops[0].get("name")]
+    below = [joint for joint in joints if link_of(joint, "parent") == tops[0].get("name")]
     mass, origin = tops[0].find("inertial/mass"), below[0].find("origin") if below else None
     turn = "0" if origin is None else origin.get("rpy", "0")
     floats = [joint.get("type") for joint in below] == ["floating"]
     if floats:
-        turn = "0"  # it has no place of its own
+        turn = "0"  # a floating base has no fixed orientation
     if (
         [joint.get("type") for joint in below] not in (["fixed"], ["floating"])
-        or _end(below[0], "child") not in {link.get("name") for link in root.findall("link")}
+        or link_of(below[0], "child") not in {link.get("name") for link in root.findall("link")}
         or tops[0].find("visual") is not None
         or tops[0].find("collision") is not None
-        or any(_number(angle) != 0 for angle in turn.split())  # it says what is up
-        or (mass is not None and _number(mass.get("value", "0")) != 0)
+        or any(as_number(angle) != 0 for angle in turn.split())  # it says which way is up
+        or (mass is not None and as_number(mass.get("value", "0")) != 0)
     ):
         return None
     return tops[0].get("name")
@@ -249,7 +251,7 @@ def _import_urdf(path: Path, text: str, notes, lost) -> mujoco.MjSpec:
     spec.modelfiledir = str(path.parent.absolute())
     spec.compiler.fusestatic = False
     spec.compiler.discardvisual = False
-    spec.compiler.balanceinertia = True  # many URDFs have inertias that no body can have
+    spec.compiler.balanceinertia = True  # many URDFs have inertias that are impossible
     for body in spec.bodies[1:]:
         xx, yy, zz, xy, xz, yz = body.fullinertia
         tensor = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
@@ -267,7 +269,7 @@ def _import_urdf(path: Path, text: str, notes, lost) -> mujoco.MjSpec:
     return spec
 
 
-def _float(spec, model, text, notes) -> mujoco.MjModel:
+def _float(spec, text, notes) -> mujoco.MjModel:
     """Free the base of an imported URDF and merge links that do not move by themselves."""
     bases = [body for body in spec.bodies[1:] if body.parent.name == "world"]
     if len(bases) == 1 and not spec.worldbody.geoms and not bases[0].joints:
@@ -298,7 +300,7 @@ def _float(spec, model, text, notes) -> mujoco.MjModel:
 
 
 def _apply_limits(spec, text, notes):
-    """Efforts that mean nothing are dropped; velocities, which the importer drops, are added."""
+    """Drop efforts that are not above 0, and add the velocities, which the importer drops."""
     root = _urdf_root(text)
     if root is None:
         return
@@ -306,7 +308,7 @@ def _apply_limits(spec, text, notes):
     missing: dict[tuple[str, str], list[str]] = {}
 
     def given(attribute, name, values):
-        if _number(values.get(name, "0")) > 0:
+        if as_number(values.get(name, "0")) > 0:
             return True
         value = "is missing" if name not in values else f"is {values[name]}"
         missing.setdefault((attribute, value), []).append(name)
@@ -323,9 +325,9 @@ def _apply_limits(spec, text, notes):
     if hinges:
         spec.add_numeric(name="velocity_limits", data=data, size=len(data))
     instead = {
-        "effort": "which limits no torque: the weight on one foot times the length of a leg is "
+        "effort": "which sets no limit: the weight on one foot times the length of a leg is "
         "used instead, as in the note on torque limits",
-        "velocity": f"which limits no velocity: {VELOCITY_LIMIT:g} rad/s is used instead",
+        "velocity": f"which sets no limit: {VELOCITY_LIMIT:g} rad/s is used instead",
     }
     notes += [
         f"{attribute} of {each('joint', names)} {value}, {instead[attribute]}; to say it yourself "
@@ -345,6 +347,7 @@ def _feet_of_links(spec, fixed) -> Iterator[str]:
     """
     if any(FOOT.search(geom.name) for geom in spec.geoms):
         return
+    # One link per leg: of several, one that collides, then the one with most geoms.
     links = {}
     for link in (link for link in fixed if _FOOT_LINK.search(link.name)):
         leg = carrier(spec, link).name
@@ -352,6 +355,7 @@ def _feet_of_links(spec, fixed) -> Iterator[str]:
         links[leg] = max(best, link, key=lambda x: (_touching(x) != [], len(x.geoms)))
     feet = {link.name: _touching(link) for link in links.values()}
     guessed, markers = [], []
+    # A link that touches nothing leaves its name to the sole beside it, if there is one.
     if not all(feet.values()):
         model = spec.compile()
         data = posed(model, model.qpos0)
@@ -368,6 +372,7 @@ def _feet_of_links(spec, fixed) -> Iterator[str]:
                 feet[name] = [geoms[index] for index in group]
                 if tall:
                     feet[name] = [add_foot(spec, geoms, model, data, group)]
+    # What is left gets a sphere, and all get the names of their links.
     for link in links.values():
         if not feet[link.name] and not link.geoms:
             length, body = 0.0, link

@@ -1,4 +1,4 @@
-"""What the method sees in a robot file: problems, what was inferred, warnings of plain physics."""
+"""What the method sees in a robot file: problems, what was inferred, and physical warnings."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ class Report:
     inferred: tuple[str, ...]
     """What the file lacks and what is assumed instead, with the way to say it in the file."""
     warnings: tuple[str, ...]
-    """What can be used but looks wrong or will hurt."""
+    """What can be used, but looks wrong or will cause trouble."""
     summary: dict[str, str] = field(default_factory=dict)
     """What the method sees, label -> value."""
 
@@ -113,9 +113,9 @@ class Report:
 def validate_robot(name_or_path: str | Path) -> Report:
     """Report on a robot file (MJCF or URDF), or a robot of `robots()`.
 
-    Everything that `load_robot` would raise for the file is a problem of the report; a value that
-    can be neither a name nor a path raises TypeError or ValueError. Takes well under a second
-    without meshes.
+    Everything that `load_robot` would raise for the file is a problem of the report. A value that
+    can be neither a name nor a path raises TypeError or ValueError. Takes well under a second for a
+    file without meshes.
     """
     path = require_path("robot", name_or_path)
     try:
@@ -270,7 +270,7 @@ def warn_plausibility(robot: Robot, held: Held) -> Iterator[str]:
             "the quaternion (numbers 4 to 7 of qpos)"
         )
     mass, height = model.body_mass[1:].sum(), robot.home[2]
-    lies = leg_drop(robot) < FLAT  # its trunk is near the floor whatever the units are
+    lies = leg_drop(robot) < FLAT  # then its trunk is near the floor in any units
     if not 0.1 < mass < 300 or not (0.03 < height or lies) or height >= 3:
         yield f"{mass:.3g} kg and a trunk {height:.3g} m high: are the units kg and m?"
     if not np.allclose(model.opt.gravity, [0, 0, -9.81], atol=0.05):
@@ -281,7 +281,7 @@ def warn_plausibility(robot: Robot, held: Held) -> Iterator[str]:
     if light:
         yield (
             f"gravity is compensated at bodies {listed(light)}: the legs carry less than their "
-            "weight, as on no real robot; remove gravcomp"
+            "weight, which does not happen on a real robot; remove gravcomp"
         )
     gap = float(robot.home[2] - standing_pose(robot.model, robot.home, robot.feet)[2])
     if abs(gap) > FLOOR_TOLERANCE * height:

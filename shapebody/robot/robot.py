@@ -1,4 +1,4 @@
-"""Robots: a compiled MJCF file plus what the method reads from it.
+"""A robot: a compiled MJCF file plus what the method reads from it.
 
 A robot file is plain MJCF: one floating body, hinge joints with limits, position actuators, feet
 that touch the floor, an IMU site and a "home" keyframe. What else an MJCF or URDF file lacks is
@@ -36,7 +36,7 @@ SUFFIXES = (".xml", ".urdf", ".mjcf")
 
 
 def require_robot(robot) -> "Robot":
-    """The argument; TypeError if it is no Robot, such as a name."""
+    """`robot` itself. Raises TypeError if it is not a `Robot`, but its name, for example."""
     require_kind("robot", robot, Robot, f"load it with shapebody.load_robot({shortened(robot)})")
     return robot
 
@@ -51,7 +51,7 @@ class Robot:
     path: Path | None
     xml: str
     """MJCF text that stands by itself: that of the file, or the completed one if the file lacks
-    anything, be it only sensors, foot-floor contacts or the targets of "home". Plain MuJoCo
+    anything, even if only sensors, foot-floor contacts or the targets of "home". Plain MuJoCo
     simulates it as the method does. Loaded again, it gives the same robot with nothing inferred."""
     model: mujoco.MjModel
     joints: np.ndarray
@@ -156,8 +156,8 @@ def load_robot(name_or_path: str | Path) -> Robot:
     """Load a robot by name (see `robots()`) or from an MJCF or URDF file.
 
     Any Path is a file, and so is a string that ends in ".xml" or ".urdf", contains a "/", or names
-    an existing file but no shipped robot. What the file lacks is inferred where that is possible;
-    `Robot.inferred` says what, and `shapebody.validate_robot` shows it.
+    an existing file and not a shipped robot. What the file lacks is inferred where that is
+    possible; `Robot.inferred` says what, and `shapebody.validate_robot` shows it.
 
     Raises ValueError for an unknown name, for text that MuJoCo cannot compile and for a model that
     does not fit (every problem is listed); FileNotFoundError for a missing file.

@@ -1,4 +1,4 @@
-"""Position servos of a robot file that has motors, none, or those of another kind."""
+"""Position servos for a robot file with motors, with other drives or without actuators."""
 
 from collections.abc import Iterator
 

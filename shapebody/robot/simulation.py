@@ -59,9 +59,9 @@ def sensor_slices(model: mujoco.MjModel) -> dict[str, slice] | None:
 
 def add_what_simulates(spec: mujoco.MjSpec, model: mujoco.MjModel) -> bool:
     """Add to `spec` the missing sensors and foot-floor pairs, and let "home" be a state at rest
-    whose targets are its joint positions; says whether anything was changed.
+    whose targets are its joint positions. Returns whether anything was changed.
 
-    With it, the file alone simulates in MuJoCo as the robot does here.
+    With these the file simulates in plain MuJoCo as the robot does here.
     """
     return any([_add_sensors(spec, model), _add_pairs(spec, model), _rest_home(spec, model)])
 

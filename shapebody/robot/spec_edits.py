@@ -10,7 +10,7 @@ _GEOM, _JOINT = mujoco.mjtGeom, mujoco.mjtJoint
 
 
 COLLISION_GROUP = 5
-FOOT = re.compile("foot(?!print)", re.IGNORECASE)  # "base_footprint" is no foot
+FOOT = re.compile("foot(?!print)", re.IGNORECASE)  # "base_footprint" is not a foot
 
 # Integers compare equal with what models hold and with what specs hold.
 MESHES = tuple(map(int, (_GEOM.mjGEOM_MESH, _GEOM.mjGEOM_HFIELD, _GEOM.mjGEOM_SDF)))
@@ -167,8 +167,8 @@ def drop_geom(spec, geom):
 def add_floor(spec) -> str:
     """Add the floor; returns the note that says so.
 
-    A file without a floor mostly has no light and no sky either, and pictures of it would be
-    black: both are added where missing.
+    A file without a floor rarely has a light or a sky, and pictures of it would be black: both are
+    added where they are missing.
     """
     floor = spec.worldbody.add_geom(name="floor", type=_GEOM.mjGEOM_PLANE, size=[0, 0, 0.05])
     floor.contype = floor.conaffinity = 0

@@ -1,4 +1,4 @@
-"""The standing test of a report: a second in the nominal pose, and what it says about a robot."""
+"""The standing test of a report: a second in the nominal pose, and the warnings it gives."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -138,19 +138,19 @@ def warn_standing(robot: Robot, held: Held) -> Iterator[str]:
             f"high for the smallest inertias{named} (kp {robot.p_gain:g}, kv {robot.d_gain:g}); "
             f"lower them, or add armature to the joints: {_advised_armature(robot)} is enough"
         )
-    elif held.fell and leg_drop(robot) >= FLAT:  # what lies cannot fall
+    elif held.fell and leg_drop(robot) >= FLAT:  # a robot that lies flat cannot fall
         if (held.reversing > CHATTER).any():
-            cause = "Its torques chatter, which is told apart and may be why: correct that first"
+            cause = "Its torques chatter (see that warning), which may be why: correct that first"
         elif held.sunk > 1:
             cause = (
-                "Only its feet touch the floor, so it fell over and the trunk went through: see "
-                'that "home", the feet, kp and the torque limits are as meant'
+                "Only its feet touch the floor, so it fell over and the trunk went through: check "
+                'that "home", the feet, kp and the torque limits are as intended'
             )
         else:
             cause = (
-                "With gains as soft as the paper's that is usual (many of its robots do, the Go2 "
-                'among them) and the policy learns to hold it; but see that "home", kp and the '
-                "torque limits are as meant"
+                "With gains as soft as the paper's that is usual (many of its robots fall, the "
+                'Go2 among them) and the policy learns to hold it; but check that "home", kp and '
+                "the torque limits are as intended"
             )
         yield (
             f"it falls out of its nominal pose: within 1 s the trunk sinks by {held.sunk:.0%} of "
@@ -207,7 +207,7 @@ def warn_drives(robot: Robot, held: Held) -> Iterator[str]:
     if straining:
         when = ", in which it falls," if held.fell else ""
         yield (
-            f"in the standing test{when} the torque is at its limit at {straining}: no more is "
+            f"in the standing test{when} the torque is at its limit at {straining}: nothing is "
             "left to hold the pose or to move; raise forcerange (in a URDF, effort) if the motor "
             'gives more, or correct "home" so that the weight is above the feet'
         )
@@ -223,7 +223,7 @@ def warn_gains(robot: Robot, held: Held) -> Iterator[str]:
         yield (
             f"kp {robot.p_gain:g} N m/rad is low for {mass:.3g} kg: robots of the paper have about "
             f"{GAIN_PER_MASS:g} per kg, here {usual:.0f}, though its heaviest have 80 to 100 and "
-            "the policy has to hold them. For a robot that gives way less, write "
+            "the policy has to hold them. For a stiffer robot write "
             f'kp="{usual:.0f}" kv="{d_gain:.2g}" in every <position>, with armature of '
             f"{needed:.2g} kg m² or more"
         )

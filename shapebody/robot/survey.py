@@ -1,7 +1,7 @@
-"""What a robot file asks for, told from its text and from the sizes of the files that it names.
+"""What a robot file asks for, judged from its text and the sizes of the files that it names.
 
 The survey sees what MuJoCo's lenient parser sees, which is not always correct XML. It takes time in
-proportion to the text, and refuses what only serves to overflow, to wait or to fill the memory.
+proportion to the text, and refuses what can only overflow, take forever or fill the memory.
 """
 
 from __future__ import annotations
@@ -85,7 +85,7 @@ class _Survey:
     rays: float = 1
     """Pixels of the camera that has most, each of which can be a ray of a range finder."""
     files: dict[str, str] = field(default_factory=dict)
-    """What tells that a file has changed, by its path."""
+    """For every file, by its path, a text that changes with the file."""
 
     def spend(self, what: str, amount: float, place: str) -> None:
         self.totals[what] += amount
@@ -198,7 +198,7 @@ _SKIPPED = {"<!--": "-->", "<![CDATA[": "]]>", "<?": "?>", "<!": ">"}
 def _tags(text: str) -> Iterator[tuple[int, str, str, dict[str, str]]]:
     """Line, kind (start, empty, end or bad), name or fault, and attributes of the tags of a text.
 
-    What is no tag is left for MuJoCo to complain of.
+    Anything that is not a tag is left for MuJoCo to report.
     """
     line, counted, position = 1, 0, 0
     while (position := text.find("<", position)) >= 0:
@@ -237,7 +237,7 @@ def _number(text: str) -> float:
 
 
 def _made(tag: str, attributes: dict[str, str]) -> float:
-    """How many times an element repeats what is in it, or parts that it makes."""
+    """How often an element repeats what is in it, or how many parts it makes."""
     if tag == "flexcomp" and attributes.get("type", "grid") == "grid":
         counts = attributes.get("count", "10 10 10")
     else:
@@ -246,14 +246,14 @@ def _made(tag: str, attributes: dict[str, str]) -> float:
 
 
 def _moves(parent: str, attributes: dict[str, str]) -> bool:
-    """Whether a <joint> is one, not a default, a constraint or what a transmission refers to."""
+    """Whether a <joint> is a joint of a body, not a default, a constraint or a reference to one."""
     if parent == "robot":
         return attributes.get("type") not in ("fixed", "floating")
     return parent in ("body", "frame", "replicate") and attributes.get("type") != "free"
 
 
 def _check_numbers(survey: _Survey, place: str, tag: str, attributes: dict[str, str]) -> None:
-    """Refuse sizes, counts and lists that only serve to overflow or to wait."""
+    """Refuse sizes, counts and lists that can only overflow or take forever."""
     if len(attributes) > _MOST_ATTRIBUTES:
         survey.refuse(
             place,
@@ -320,7 +320,7 @@ def _text(survey: _Survey, path: Path, place: str) -> str:
 
 
 def _checked(survey: _Survey, path: Path, place: str) -> os.stat_result:
-    """State of a file; ValueError for one that can be waited for, or never ends."""
+    """State of a file; ValueError for a pipe or a device, reading which may never end."""
     state = os.stat(path)
     if not stat.S_ISREG(state.st_mode):
         survey.refuse(place, f"reads {path}, which is a pipe or a device: expected a file")
@@ -329,7 +329,7 @@ def _checked(survey: _Survey, path: Path, place: str) -> os.stat_result:
 
 
 def _first(places: Iterable[Path]) -> Path | None:
-    """The first place where there is something other than a folder."""
+    """The first place that exists and is not a folder."""
     for place in places:
         try:
             if not stat.S_ISDIR(os.stat(place).st_mode):
@@ -346,7 +346,7 @@ def _file(survey, document, place: str, name: str, folder: Path) -> Path | None:
 
 
 def _weigh(survey: _Survey, document: _Document, place: str, name: str) -> None:
-    """Add the size of a mesh, picture or other asset; what is missing has none."""
+    """Add the size of a mesh, picture or other asset; a missing file adds nothing."""
     _check_name(survey, place, name)
     folder = document.folder
     parts = Path(name.split("://")[-1]).parts

@@ -1,4 +1,4 @@
-"""What is wrong in the text of a URDF and MuJoCo's importer does not notice."""
+"""Checks of the text of a URDF, for mistakes that MuJoCo's importer does not notice."""
 
 import re
 from collections import Counter
@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from shapebody.robot.finite import is_finite, written
+from shapebody.robot.finite import is_finite, not_finite
 from shapebody.robot.spec_edits import each, listed
 
 
@@ -23,7 +23,7 @@ def check_urdf(path: Path, root) -> list[str]:
     wrong: dict[tuple[str, str], list[str]] = {}
     for attribute in ("velocity", "effort"):
         for joint, value in limits_of(root, attribute):
-            if not is_finite(number(value)):
+            if not is_finite(as_number(value)):
                 wrong.setdefault((attribute, value), []).append(repr(joint))
     reasons = []
     if repeated:
@@ -35,7 +35,7 @@ def check_urdf(path: Path, root) -> list[str]:
         unit = {"velocity": "rad/s", "effort": "N m"}[attribute]
         expected = (
             f"a number ({unit}); write it, or expand the xacro template that the file comes from"
-            if np.isnan(number(value))
+            if np.isnan(as_number(value))
             else f"a finite number ({unit}); correct it, or write 0 for no limit"
         )
         reasons.append(
@@ -52,7 +52,7 @@ def check_urdf(path: Path, root) -> list[str]:
     reasons += problems
     if not wrong:
         numbers = [part for kind in ("link", "joint") for part in root.findall(kind)]
-        found = [finding for part in numbers for finding in written(part)]
+        found = [finding for part in numbers for finding in not_finite(part)]
         if found:
             reasons.append(f"expected finite numbers, but {listed(found)}; correct them")
     if reasons:
@@ -62,10 +62,10 @@ def check_urdf(path: Path, root) -> list[str]:
 
 
 def drop_endless_visuals(root) -> Iterator[str]:
-    """Take visuals with numbers that are not finite out of a URDF: a robot needs no looks."""
+    """Take visuals with numbers that are not finite out of a URDF: only looks depend on them."""
     for link in root.findall("link"):
         for visual in link.findall("visual"):
-            wrong = written(visual)
+            wrong = not_finite(visual)
             if wrong:
                 link.remove(visual)
                 yield (
@@ -87,15 +87,15 @@ _LONGEST = 1000  # links from the root: MuJoCo reads no more, and takes long to 
 def _check_base(path: Path, root):
     """Raises ValueError for a robot that is fixed to the world."""
     joints = root.findall("joint")
-    children = {end(joint, "child") for joint in joints}
+    children = {link_of(joint, "child") for joint in joints}
     for link in root.findall("link"):
         name = link.get("name") or ""
         if not _WORLD.match(name):
             continue
-        below = [joint for joint in joints if end(joint, "parent") == name]
+        below = [joint for joint in joints if link_of(joint, "parent") == name]
         if name not in children and {joint.get("type") for joint in below} == {"fixed"}:
             fixed = listed(repr(joint.get("name")) for joint in below)
-            bases = listed(repr(end(joint, "child")) for joint in below)
+            bases = listed(repr(link_of(joint, "child")) for joint in below)
             raise ValueError(
                 f"{path} cannot be used as a robot: it fixes the base {bases} to the world (link "
                 f"{name!r}, joint {fixed}), as that of an arm on a table: expected a robot that "
@@ -104,10 +104,10 @@ def _check_base(path: Path, root):
 
 
 def _check_tree(path: Path, root):
-    """Raises ValueError for links and joints that form no tree, or one that is too deep."""
+    """Raises ValueError if links and joints do not form a tree, or form one that is too deep."""
     names = [link.get("name") for link in root.findall("link")]
     joints = [
-        (joint.get("name"), end(joint, "parent"), end(joint, "child"))
+        (joint.get("name"), link_of(joint, "parent"), link_of(joint, "child"))
         for joint in root.findall("joint")
     ]
     if len(set(names)) < len(names) or None in names:
@@ -121,8 +121,8 @@ def _check_tree(path: Path, root):
     problems = [
         f"joint {joint!r} has no <{kind} link>: add it"
         if link is None
-        else f"joint {joint!r} has the {kind} {link!r}, which is no link: correct its name, or add "
-        "the link"
+        else f"joint {joint!r} has the {kind} {link!r}, which is not a link: correct its name, or "
+        "add the link"
         for joint, *ends in joints
         for kind, link in zip(("parent", "child"), ends, strict=True)
         if link not in known
@@ -136,48 +136,54 @@ def _check_tree(path: Path, root):
         for child, above in parents.items()
         if len(above) > 1
     ]
+    if not problems:
+        problems += _not_one_tree(names, {child: above[0][1] for child, above in parents.items()})
+    if problems:
+        raise ValueError(f"{path} is not a valid URDF file: {listed(problems)}")
+
+
+def _not_one_tree(names, parents: dict[str, str]) -> Iterator[str]:
+    """Why links do not hang from one base: at most one message. `parents` are links by child."""
     tops = [name for name in names if name not in parents and name != "world"]
-    tops += ["world"] if "world" in [parent for _, parent, _ in joints] else []
-    if not problems and len(tops) > 1:
-        problems.append(
-            f"links {listed(map(repr, tops))} are no child of a joint: expected one such link, the "
-            "base; connect the others to it by joints, or remove them"
+    tops += ["world"] if "world" in parents.values() else []
+    if len(tops) > 1:
+        yield (
+            f"links {listed(map(repr, tops))} are not the child of any joint: expected one such "
+            "link, the base; connect the others to it by joints, or remove them"
         )
-    depth = {name: 0 for name in tops}
+        return
     children: dict[str, list[str]] = {}
-    for child, above in parents.items():
-        children.setdefault(above[0][1], []).append(child)
-    waiting = list(tops) if not problems else []
+    for child, parent in parents.items():
+        children.setdefault(parent, []).append(child)
+    depth, waiting = {name: 0 for name in tops}, list(tops)
     while waiting:
         name = waiting.pop()
         for child in children.get(name, ()):
             depth[child] = depth[name] + 1
             waiting.append(child)
     circle = [name for name in names if name not in depth and name != "world"]
-    if not problems and circle:
-        problems.append(
+    if circle:
+        yield (
             f"links {listed(map(repr, circle))} are below each other in a circle: expected a tree "
             "that starts at the base; correct the parents of their joints"
         )
-    elif not problems and max(depth.values(), default=0) > _LONGEST:
-        problems.append(
+    elif max(depth.values(), default=0) > _LONGEST:
+        yield (
             f"it has a chain of {max(depth.values()):,} links: expected at most {_LONGEST:,}; "
             "merge links that do not move by themselves"
         )
-    if problems:
-        raise ValueError(f"{path} is not a valid URDF file: {listed(problems)}")
 
 
 def _check_inertias(root) -> tuple[list[str], list[str]]:
-    """Notes and problems about inertias that no body has.
+    """Notes and problems about inertias that a real body cannot have.
 
-    Those that are not positive definite are left out, which is a problem where a moving part has
-    no other. Those with one principal moment above the sum of the others are made equal.
+    Those that are not positive definite are left out, which is a problem if a moving part has no
+    other. Those with one principal moment above the sum of the others get three equal moments.
     """
     links = {link.get("name"): link for link in root.findall("link")}
     part = {name: name for name in links}  # the first link of what moves as one
     fixed = {
-        end(joint, "child"): end(joint, "parent")
+        link_of(joint, "child"): link_of(joint, "parent")
         for joint in root.findall("joint")
         if joint.get("type") == "fixed"
     }
@@ -192,7 +198,7 @@ def _check_inertias(root) -> tuple[list[str], list[str]]:
         if inertia is None:
             continue
         xx, yy, zz, xy, xz, yz = (
-            number(inertia.get(key, "0")) for key in ("ixx", "iyy", "izz", "ixy", "ixz", "iyz")
+            as_number(inertia.get(key, "0")) for key in ("ixx", "iyy", "izz", "ixy", "ixz", "iyz")
         )
         tensor = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
         if not is_finite(tensor).all() or not tensor.any():
@@ -208,32 +214,32 @@ def _check_inertias(root) -> tuple[list[str], list[str]]:
     lone = [text for name, text in wrong.items() if part[name] not in right]
     merged = [text for name, text in wrong.items() if part[name] in right]
     problems = [
-        f"inertia of {each('link', lone)} is not positive definite, which no body has: correct "
-        "ixx to izz, e.g. by those of a box of the same mass and size"
+        f"inertia of {each('link', lone)} is not positive definite, which is impossible: correct "
+        "ixx to izz, e.g. to those of a box of the same mass and size"
     ]
     notes = []
     if merged:
         notes.append(
-            f"inertia of {each('link', merged)} is not positive definite, which no body has: it is "
-            "left out, and what moves as one with it has the inertia of the other links"
+            f"inertia of {each('link', merged)} is not positive definite, which is impossible: it "
+            "is left out, and what moves as one with it has the inertia of the other links"
         )
     if uneven:
         notes.append(
             f"inertia of {each('link', uneven)} has a principal moment above the sum of the "
-            "others, which no body has: it is replaced by three equal ones of the same sum (kg "
+            "others, which is impossible: it is replaced by three equal ones of the same sum (kg "
             "m²); to say it yourself correct ixx to izz"
         )
     return notes, problems if lone else []
 
 
-def end(joint, kind: str) -> str | None:
-    """Name of the "parent" or "child" link of a URDF joint."""
+def link_of(joint, kind: str) -> str | None:
+    """Name of the "parent" or "child" link of a URDF joint; None if it does not have one."""
     element = joint.find(kind)
     return None if element is None else element.get("link")
 
 
-def number(text: str) -> float:
-    """The number that a text is; NaN if it is none."""
+def as_number(text: str) -> float:
+    """A text as a number; NaN if it is not a number."""
     try:
         return float(text)
     except ValueError:
@@ -241,7 +247,7 @@ def number(text: str) -> float:
 
 
 def limits_of(root, attribute: str) -> Iterator[tuple[str, str]]:
-    """Joints and the texts of an attribute of their limits."""
+    """Names of joints with the text of an attribute ("effort", "velocity") of their <limit>."""
     for joint in root.findall("joint"):
         limit = joint.find("limit")
         if limit is not None and limit.get(attribute) is not None:
