@@ -17,8 +17,7 @@ from test_robots import own_robot
 
 import shapebody as sb
 from shapebody.files import data_dir
-from shapebody.robot import guard, survey
-from shapebody.robot.importing import read
+from shapebody.robot import guard, importing, survey
 from shapebody.robot.robot import load_robot, robots
 
 PARTS = {"before": "", "attributes": "", "inside": "", "after": ""}
@@ -26,6 +25,11 @@ SMALL = (
     "<mujoco{attributes}>{before}<worldbody><body name='b'><freejoint/><geom size='1'/>{inside}"
     "</body></worldbody>{after}</mujoco>"
 )
+
+
+def read(path):
+    guard.admit(path)
+    return importing.read(path)
 
 
 def small(folder, name="small.xml", **parts):
@@ -267,12 +271,12 @@ def test_joints_and_depth_of_what_was_compiled(tmp_path):
         return mujoco.MjSpec.from_string(SMALL.format(**PARTS | {"inside": text})).compile()
 
     hinge = "<body><joint/><geom size='1'/>"
-    guard.require_writable(tmp_path, model(f"{hinge}</body>" * 500))
+    importing.require_writable(tmp_path, model(f"{hinge}</body>" * 500))
     with pytest.raises(ValueError, match="501 joints"):
-        guard.require_writable(tmp_path, model(f"{hinge}</body>" * 501))
-    guard.require_writable(tmp_path, model("<body>" * 470 + "</body>" * 470))
+        importing.require_writable(tmp_path, model(f"{hinge}</body>" * 501))
+    importing.require_writable(tmp_path, model("<body>" * 470 + "</body>" * 470))
     with pytest.raises(ValueError, match="chain of 486 bodies"):
-        guard.require_writable(tmp_path, model("<body>" * 485 + "</body>" * 485))
+        importing.require_writable(tmp_path, model("<body>" * 485 + "</body>" * 485))
 
 
 def test_every_shipped_robot_would_pass():
@@ -308,16 +312,20 @@ def test_a_reader_that_does_not_end(tmp_path, unsurveyed, monkeypatch):
 def test_memory_is_limited(tmp_path, unsurveyed):
     path = small(tmp_path, before='<size nuser_body="2000000000"/>')
     assert "memory" in refusal(path, seconds=20)
-    program = f"import shapebody.robot.guard as g; g._limit_memory(); bytearray({2 * guard.MEMORY})"
+    program = f"import shapebody.robot.guard as g; g.limit_memory(); bytearray({2 * guard.MEMORY})"
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
     assert "MemoryError" in done.stderr
 
 
 PROGRAM = """
 import os
-from shapebody.robot import guard
-from shapebody.robot.importing import read
+from shapebody.robot import guard, importing
 from pathlib import Path
+
+def read(path):
+    guard.admit(path)
+    return importing.read(path)
+
 survey, guard.files_of = guard.files_of, lambda path: {}
 try:
     read(Path("bad.xml"))
@@ -326,19 +334,19 @@ except ValueError as error:
 
 guard.files_of = survey
 read(Path("good.xml"))
-other = guard._reader.process.pid
+other = guard.reader.process.pid
 read(Path("good.xml"))
-assert guard._reader.process.pid == other
+assert guard.reader.process.pid == other
 child = os.fork()
 if child == 0:
     read(Path("good.xml"))
     Path("good.xml").write_text(Path("good.xml").read_text() + "  ")
     read(Path("good.xml"))
-    os._exit(0 if guard._reader.process.pid != other else 1)
+    os._exit(0 if guard.reader.process.pid != other else 1)
 
 assert os.waitpid(child, 0)[1] == 0
 read(Path("good.xml"))
-assert guard._reader.process.pid == other
+assert guard.reader.process.pid == other
 print("other process", other)
 """
 
@@ -367,7 +375,7 @@ def test_other_ways_to_run_python(tmp_path, way):
 
 
 def test_without_another_process(tmp_path, monkeypatch):
-    monkeypatch.setattr(guard, "_reader", guard._Reader())
+    monkeypatch.setattr(guard, "reader", guard.Reader())
     monkeypatch.setattr(sys, "executable", str(tmp_path / "none"))
     with pytest.warns(UserWarning, match="without protection"):
         load_robot(own_robot(tmp_path))
@@ -377,7 +385,7 @@ def test_the_same_content_is_read_elsewhere_once(tmp_path, monkeypatch):
     path = quadruped(tmp_path)
     load_robot(path)
     judged = []
-    monkeypatch.setattr(guard._reader, "judge", lambda path: (judged.append(path) or "", True))
+    monkeypatch.setattr(guard.reader, "judge", lambda path: (judged.append(path) or "", True))
     load_robot(path)
     load_robot("anymal_c")
     assert judged == []

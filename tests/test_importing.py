@@ -603,8 +603,8 @@ def test_a_base_below_a_floating_joint(tmp_path, plain, parent, between):
 NO_TREE = {
     "planar": ('<link name="odom"/>' + FIXED.replace('"fixed"', '"planar"'), "odom base", "planar"),
     "table": ('<link name="table"/>' + FIXED, "table base", "fixes the base 'base' to the world"),
-    "no such link": (FIXED, "base hand", "has the child 'hand', which is no link"),
-    "two bases": ('<link name="spare"/>', None, "are no child of a joint"),
+    "no such link": (FIXED, "base hand", "has the child 'hand', which is not a link"),
+    "two bases": ('<link name="spare"/>', None, "are not the child of any joint"),
     "circle": (FIXED, "l_sole base", "in a circle"),
     "own parent": ('<link name="q"/>' + FIXED, "q q", "'q' are below each other in a circle"),
     "two parents": (FIXED, "r_shin l_sole", "'l_sole' is the child of each of joints"),
@@ -612,7 +612,7 @@ NO_TREE = {
 
 
 @pytest.mark.parametrize("case", NO_TREE)
-def test_links_that_are_no_tree(tmp_path, case):
+def test_links_that_do_not_form_a_tree(tmp_path, case):
     extra, ends, message = NO_TREE[case]
     parent, child = ends.split() if ends else ("", "")
     (problem,) = validate_robot(

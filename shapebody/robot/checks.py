@@ -19,7 +19,7 @@ _JOINT, _OBJ = mujoco.mjtJoint, mujoco.mjtObj
 
 MIN_MASS, MIN_INERTIA = 1e-7, 1e-11  # kg, kg m²; those of real robots are above 1e-6 and 1e-10
 
-FAR = 1e4  # m and rad: no robot is there
+FAR = 1e4  # m and rad, beyond which there is no robot
 
 MAX_TILT = 45.0  # degrees of the trunk in "home"
 

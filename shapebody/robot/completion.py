@@ -16,11 +16,11 @@ from shapebody.robot.entries import custom_numeric
 from shapebody.robot.feet import foot_ids
 from shapebody.robot.foot_completion import infer_feet
 from shapebody.robot.home import infer_height, infer_home
-from shapebody.robot.importing import IMU, VELOCITY_LIMIT
 from shapebody.robot.servos import infer_actuators
 from shapebody.robot.spec_edits import (
     COLLISION_GROUP,
     FOOT,
+    IMU,
     MESHES,
     add_floor,
     drop_assets,
@@ -33,6 +33,7 @@ from shapebody.robot.spec_edits import (
     unused,
     write_inertial,
 )
+from shapebody.robot.urdf import VELOCITY_LIMIT
 
 _GEOM = mujoco.mjtGeom
 

@@ -19,7 +19,8 @@ import warnings
 from pathlib import Path
 
 from shapebody.files import data_dir
-from shapebody.robot.survey import MAX_DEPTH, MAX_NUMBERS, files_of, too_many
+from shapebody.robot.importing import read
+from shapebody.robot.survey import files_of
 
 SECONDS = 120  # for one file; a mesh of 200,000 triangles takes up to 6
 MEMORY = 2**32  # bytes
@@ -34,11 +35,11 @@ def admit(path: Path) -> None:
     Raises ValueError, naming the file, if it asks for more than a robot needs, or if reading it
     fails, crashes, or takes more than `SECONDS` or `MEMORY`; OSError if it cannot be opened.
     """
-    if _reader.inside or _is_shipped(path) or path.is_dir():
+    if _is_shipped(path) or path.is_dir():
         return
     key = (os.path.abspath(path), str(path), tuple(sorted(files_of(path).items())))
     if key not in _answers:
-        problem, lasting = _reader.judge(path)
+        problem, lasting = reader.judge(path)
         if not lasting:
             raise ValueError(problem)
         _answers[key] = problem
@@ -49,22 +50,6 @@ def admit(path: Path) -> None:
 _answers: dict[tuple, str] = {}
 
 
-def require_writable(path: Path, model) -> None:
-    """ValueError if the completed file of a compiled robot could not be read again."""
-    num_joints = int((model.jnt_type != 0).sum())  # without the free joint
-    if max(num_joints, model.nu) > MAX_NUMBERS:
-        what = "joints" if num_joints > MAX_NUMBERS else "actuators"
-        raise ValueError(too_many(path, max(num_joints, model.nu), what))
-    depth = [0] * model.nbody
-    for body in range(1, model.nbody):
-        depth[body] = depth[model.body_parentid[body]] + 1
-    if max(depth) > MAX_DEPTH:
-        raise ValueError(
-            f"{path} has a chain of {max(depth)} bodies: expected at most {MAX_DEPTH}, the depth "
-            "that MuJoCo can read; merge bodies that do not move by themselves"
-        )
-
-
 def _is_shipped(path: Path) -> bool:
     try:
         return path.resolve().parent == (data_dir() / "robots").resolve()
@@ -72,14 +57,13 @@ def _is_shipped(path: Path) -> bool:
         return False
 
 
-# The other process. It ends by itself when it is not needed.
+# The other process, which ends by itself when it is not needed.
 
 
-class _Reader:
+class Reader:
     """Reads robot files in another process, which is started when needed and replaced when lost."""
 
     def __init__(self):
-        self.inside = False  # True in the other process
         self.forget()
         atexit.register(self.stop)
         if hasattr(os, "register_at_fork"):
@@ -90,6 +74,7 @@ class _Reader:
         self.lock, self.process = threading.Lock(), None
 
     def stop(self) -> None:
+        """End the other process, if there is one."""
         if self.process is not None:
             self.process.kill()
             self.process.communicate()  # closes the pipes
@@ -108,7 +93,7 @@ class _Reader:
                     warnings.warn(
                         f"{path} is read without protection against files that crash MuJoCo, as "
                         f"no other process can be started with {sys.executable!r}",
-                        stacklevel=4,
+                        stacklevel=5,
                     )
                     return "", True
                 answer, late = self._ask({"folder": folder, "path": str(path)})
@@ -180,7 +165,7 @@ class _Reader:
             timer.cancel()
 
 
-_reader = _Reader()
+reader = Reader()
 
 
 def _cause(code: int | None) -> str:
@@ -192,12 +177,9 @@ def _cause(code: int | None) -> str:
 
 def serve() -> None:
     """Answer requests from standard input until it ends: the other process."""
-    _reader.inside = True
     answers = os.fdopen(os.dup(1), "wb")
     os.dup2(2, 1)  # what MuJoCo prints is not an answer
-    from shapebody.robot.importing import read
-
-    _limit_memory()
+    limit_memory()
     _answer(answers, "")
     for line in sys.stdin.buffer:
         request = json.loads(line)
@@ -232,7 +214,7 @@ def _alarm(seconds: int) -> None:
         signal.alarm(seconds)
 
 
-def _limit_memory() -> None:
+def limit_memory() -> None:
     """At most `MEMORY` more than now, and no core files, where the system knows such limits."""
     try:
         import resource

@@ -11,6 +11,7 @@ import mujoco
 import numpy as np
 
 from shapebody.arguments import require_output, require_path
+from shapebody.files import atomic_write
 from shapebody.robot.checks import tilt
 from shapebody.robot.feet import ends_without_foot
 from shapebody.robot.geometry import standing_pose
@@ -73,8 +74,6 @@ class Report:
                 f"{path} is the file itself, and the completed one has no meshes and other text: "
                 "give another name"
             )
-        from shapebody.files import atomic_write
-
         notes = "".join(f"\n  - {note}" for note in self.inferred)
         head = comment(f"Completed from {self.path.name}:{notes}\n") + "\n" if notes else ""
         return atomic_write(path, head + self.robot.xml)

@@ -23,6 +23,7 @@ from shapebody.robot.completion import complete
 from shapebody.robot.entries import custom_numeric, custom_text, home_qpos
 from shapebody.robot.feet import foot_ids
 from shapebody.robot.finite import check_inertials, check_text
+from shapebody.robot.guard import admit
 from shapebody.robot.importing import read
 from shapebody.robot.simulation import add_what_simulates, as_text, sensor_slices
 from shapebody.robot.spec_edits import COLLISION_GROUP
@@ -99,18 +100,22 @@ class Robot:
 
     @property
     def num_joints(self) -> int:
+        """Hinge joints."""
         return len(self.joints)
 
     @property
     def num_actuators(self) -> int:
+        """Actuators, one for each driven joint."""
         return len(self.actuated)
 
     @property
     def num_feet(self) -> int:
+        """Feet."""
         return len(self.feet)
 
     @property
     def num_spheres(self) -> int:
+        """Collision spheres."""
         return len(self.spheres)
 
     @property
@@ -204,6 +209,7 @@ def examine(path: Path) -> tuple[Robot | None, list[str], tuple[str, ...]]:
 
     Raises ValueError for a file that MuJoCo cannot compile.
     """
+    admit(path)
     text, spec, model, notes = read(path)
 
     # What cannot be inferred: with a problem here nothing can be completed.

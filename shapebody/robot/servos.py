@@ -8,8 +8,8 @@ import numpy as np
 from shapebody.robot.entries import home_qpos
 from shapebody.robot.feet import foot_ids
 from shapebody.robot.geometry import leg_length
-from shapebody.robot.importing import ARMATURE
 from shapebody.robot.spec_edits import listed, ordered
+from shapebody.robot.urdf import ARMATURE
 
 _JOINT, _TRN = mujoco.mjtJoint, mujoco.mjtTrn
 

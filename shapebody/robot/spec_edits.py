@@ -11,6 +11,7 @@ _GEOM, _JOINT = mujoco.mjtGeom, mujoco.mjtJoint
 
 COLLISION_GROUP = 5
 FOOT = re.compile("foot(?!print)", re.IGNORECASE)  # "base_footprint" is not a foot
+IMU = re.compile("imu", re.IGNORECASE)
 
 # Integers compare equal with what models hold and with what specs hold.
 MESHES = tuple(map(int, (_GEOM.mjGEOM_MESH, _GEOM.mjGEOM_HFIELD, _GEOM.mjGEOM_SDF)))

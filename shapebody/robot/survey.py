@@ -88,11 +88,13 @@ class _Survey:
     """For every file, by its path, a text that changes with the file."""
 
     def spend(self, what: str, amount: float, place: str) -> None:
+        """Add to a total; ValueError if that makes it larger than a robot needs."""
         self.totals[what] += amount
         if not self.totals[what] <= _MOST[what]:  # NaN included
             raise ValueError(too_many(self.path, self.totals[what], what, place))
 
     def refuse(self, place: str, problem: str) -> None:
+        """ValueError about an element of the file."""
         raise ValueError(f"{self.path} cannot be used as a robot: {place} {problem}")
 
 
