@@ -428,7 +428,7 @@ BAD = {
     ),
     "exchanged limits": (
         [(RIGHT_HIP, RIGHT_HIP.replace("-1 1", "1 -1"))],
-        "joint 'right_hip' has range=\"1 -1\", which is no limit: expected lower < upper",
+        "joint 'right_hip' has range=\"1 -1\", which sets no limits: expected lower < upper",
     ),
     "limits that do not hold": (
         [(RIGHT_HIP, RIGHT_HIP.replace("range", 'limited="false" range'))],
@@ -522,7 +522,7 @@ BAD = {
     ),
     "a foot that is a collision sphere": (
         [('name="left_foot"', 'name="left_foot" group="5"')],
-        "geom 'left_foot' is a foot and a collision sphere of group 5: expected one",
+        "geom 'left_foot' is both a foot and a collision sphere of group 5: expected one",
     ),
     "bad flags": (
         [("</custom>", '<numeric name="keep_nominal" data="0 2"/></custom>')],
