@@ -15,24 +15,22 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from shapebody.checkpoints import load_agent
-from shapebody.descriptions import describe
-from shapebody.design import DesignSpace
-from shapebody.evaluation import EvaluationConfig, evaluate
-from shapebody.locomotion import Locomotion, Observation, TaskConfig, Trajectory
-from shapebody.locomotion.observations import COMMAND, sphere_collisions
-from shapebody.locomotion.rewards import TERMS, Moment, combine, reward_terms
-from shapebody.networks import (
-    Critic,
-    Policy,
-    entropy,
-    initialize,
-    log_prob,
-    standardization,
-)
-from shapebody.ppo import TrainConfig, advantages, make_update
-from shapebody.robots import load_robot, robots
-from shapebody.search import METHODS, search
+from shapebody.agent.store import load_agent
+from shapebody.design.descriptions import describe
+from shapebody.design.space import DesignSpace
+from shapebody.evaluation.evaluate import EvaluationConfig, evaluate
+from shapebody.networks.critic import Critic
+from shapebody.networks.inputs import initialize, standardization
+from shapebody.networks.policy import Policy, entropy, log_prob
+from shapebody.optimizers.search import METHODS, search
+from shapebody.robot.robot import load_robot, robots
+from shapebody.task.config import TaskConfig
+from shapebody.task.env import Locomotion, Trajectory
+from shapebody.task.observations import COMMAND, Observation, sphere_collisions
+from shapebody.task.rewards import TERMS, Moment, combine, reward_terms
+from shapebody.training.config import TrainConfig
+from shapebody.training.losses import advantages
+from shapebody.training.update import make_update
 
 FOLDER = Path(__file__).parent
 GO2, HUMANOID, GOLEM = "unitree_go2", "mit_humanoid", "golem"
