@@ -56,7 +56,7 @@ def _loaded(names) -> list[Robot]:
     """The robots of these names, all shipped ones if None."""
     names = robots() if names is None else require_list("names", names, 1000)
     if not names:
-        raise ValueError("names is empty; expected at least one robot, see shapebody.robot.robot()")
+        raise ValueError("names is empty; expected at least one robot, see shapebody.robots()")
     return [load_robot(name) for name in names]
 
 
