@@ -816,6 +816,7 @@ FUNCTIONS = {
         coefficient=PROBABILITY,
         task=optional(TASK),
     ),
+    "robot.robot.Robot.pose": dict(nominal=array(2)),
     "robot.robot.find": dict(name_or_path=ROBOT_FILE),
     "robot.robot.load_robot": dict(name_or_path=ROBOT_FILE),
     "robot.robot.require_robot": dict(robot=ROBOT),

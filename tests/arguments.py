@@ -206,7 +206,7 @@ def makes(name, *classes):
     return keep
 
 
-@makes("robot")
+@makes("robot", "robot.robot.Robot")
 def _(world):
     return tiny_robot(world.folder)
 

@@ -15,7 +15,7 @@ from pathlib import Path
 import mujoco
 import numpy as np
 
-from shapebody.arguments import require_kind, require_path
+from shapebody.arguments import require_array, require_kind, require_path
 from shapebody.arguments import shown as shortened
 from shapebody.files import data_dir
 from shapebody.robot.checks import CHECKS, check_feet, check_home, check_masses
@@ -129,9 +129,12 @@ class Robot:
         return self.model.jnt_dofadr[self.joints[self.actuated]].astype(int)
 
     def pose(self, nominal) -> np.ndarray:
-        """float64[nq], the home pose with the actuated joints at `nominal` [nu], rad."""
+        """float64[nq], the home pose with the actuated joints at `nominal` [nu], rad.
+
+        Raises ValueError for another number of angles.
+        """
         qpos = self.home.copy()
-        qpos[self.qpos_index] = nominal
+        qpos[self.qpos_index] = require_array("nominal", nominal, (self.num_actuators,))
         return qpos
 
     @property
