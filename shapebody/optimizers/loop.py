@@ -5,8 +5,8 @@
         designs <- propose(memory)
         memory <- update(memory, their scores on a new minibatch of states)
 
-`iterate` runs this loop. Random search, TuRBO, PSO, CEM, DE, ARS and GC-PFO are its three
-functions, each in a module of its own; VGDS, CMA-ES and BO have loops of their own.
+`iterate` runs this loop. Random search, TuRBO, PSO, CEM, DE, ARS and GC-PFO are three functions for
+it, each in its own module; VGDS, CMA-ES and BO have loops of their own.
 """
 
 from __future__ import annotations

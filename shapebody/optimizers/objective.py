@@ -72,24 +72,22 @@ class Objective:
     and foot observations, velocities, commands); everything that describes the body comes from
     Φ(f). A pytree: it can be an argument of jitted functions, and another λ, reference, critic or
     seed needs no new compilation.
-
-    Attributes:
-        critic: variables of the critic.
-        states: the state bank, an Observation with leading axis M.
-        reference: f_ref, float32 [d].
-        free: which entries of f count, bool [d]; the others are held at f_ref.
-        trust_region: λ, float32 [].
-        values: the critic as a function of designs and states.
-        batch_size: states per minibatch.
     """
 
     critic: Any
+    """Variables of the critic."""
     states: Observation
+    """The state bank, with leading axis M."""
     reference: jax.Array
+    """f_ref, float32 [d]."""
     free: jax.Array
+    """Which entries of f count, bool [d]; the others are held at f_ref."""
     trust_region: jax.Array
+    """λ, float32 []."""
     values: DesignCritic = field(metadata=dict(static=True))
+    """The critic as a function of designs and states."""
     batch_size: int = field(default=64, metadata=dict(static=True))
+    """States per minibatch."""
 
     @classmethod
     def of(

@@ -73,34 +73,30 @@ METHODS: dict[str, Method] = {
 
 @dataclass(frozen=True, eq=False)
 class SearchResult:
-    """Outcome of a search from one design [d] or from S designs [S, d]; NumPy arrays, float32.
-
-    Attributes:
-        design: the found design(s), [d] or [S, d].
-        trajectory: designs from the start (row 0) to the end, [N + 1, d] or [N + 1, S, d].
-        objective: Ĵ_λ of `design` on the whole state bank, a float or [S].
-        history: Ĵ_λ along the trajectory, each on the minibatch of its iteration, [N + 1(, S)].
-        evaluations: number of designs that the method scored per start, each on one minibatch;
-            scores that only fill `history` are not counted.
-        seconds: wall time of the search for all starts, compilation included.
-        compile_seconds: the part of it that went into compilation; 0 when a search of the same
-            kind (method, settings, robot, size of the critic; VGDS also: number of starts) ran
-            before.
-        method: name of the method.
-        settings: all settings, including trust_region, seed, batch_size and the agent's hash;
-            reference is None if it was not given, else the first 16 digits of the SHA-256 of f_ref
-            as float32; states_hash is that of the agent's states, or of those given instead.
-    """
+    """Outcome of a search from one design [d] or from S designs [S, d]; NumPy arrays, float32."""
 
     design: np.ndarray
+    """The found design(s), [d] or [S, d]."""
     trajectory: np.ndarray
+    """Designs from the start (row 0) to the end, [N + 1, d] or [N + 1, S, d]."""
     objective: np.ndarray | float
+    """Ĵ_λ of `design` on the whole state bank, a float or [S]."""
     history: np.ndarray
+    """Ĵ_λ along the trajectory, each on the minibatch of its iteration, [N + 1] or [N + 1, S]."""
     evaluations: int
+    """Number of designs that the method scored per start, each on one minibatch. Scores that only
+    fill `history` are not counted."""
     seconds: float
+    """Wall time of the search for all starts, compilation included."""
     compile_seconds: float
+    """The part of it that went into compilation; 0 if a search of the same kind (method, settings,
+    robot, size of the critic; VGDS also: number of starts) ran before."""
     method: str
+    """Name of the method."""
     settings: dict
+    """All settings, including trust_region, seed, batch_size and the agent's hash. `reference` is
+    None if it was not given, else the first 16 digits of the SHA-256 of f_ref as float32;
+    `states_hash` is that of the agent's states, or of those given instead."""
 
 
 def search(
@@ -131,7 +127,7 @@ def search(
         reference: f_ref [d], the anchor of the trust region; f = 0 if not given.
         seed: of the minibatches and of the method's own random numbers.
         batch_size: states per minibatch.
-        states: state bank to use instead of the agent's (see `objective.bank`).
+        states: state bank to use instead of the agent's (see `state_bank.bank`).
         frozen: parameters that stay as they are in f_ref, in the starts too, such as ("size",) or
             ("Torque limit", "Trunk"); see `DesignSpace.frozen`. None in the paper.
         **settings: fields of the method's configuration, such as iterations=50.

@@ -1,14 +1,17 @@
-"""Scales, agents to use at each, and experiments whose results are kept with their provenance."""
+"""How much returns depend on MuJoCo's derived constants."""
 
 import numpy as np
 
 from shapebody.arguments import require_integer
+from shapebody.design.space import DesignSpace
+from shapebody.evaluation.evaluate import EvaluationConfig, evaluate
+from shapebody.task.config import TaskConfig
 
 
 def derived_constants(
     agent, robot, starts: int = 10, episodes: int = 16, seed: int = 0, horizon: int = 1000
 ) -> list[dict]:
-    """How much returns depend on MuJoCo's derived constants (`body_invweight0` and the like).
+    """Returns with MuJoCo's derived constants (`body_invweight0` and the like) kept and recomputed.
 
     data/results/derived_constants_go2.json is `result("derived_constants_go2", ...)` of this.
 
@@ -19,29 +22,17 @@ def derived_constants(
         One record per design (the reference, then the starts): mean return with the reference's
         constants, with recomputed ones, and the standard error of their paired difference.
     """
-    from shapebody.design.space import DesignSpace
-    from shapebody.evaluation.evaluate import EvaluationConfig, evaluate
-    from shapebody.task.config import TaskConfig
-
     space = DesignSpace(robot)
     require_integer("starts", starts, 0, 100_000)
-    # A standard error needs two.
-    require_integer("episodes", episodes, 2, 1_000_000)
+    require_integer("episodes", episodes, 2, 1_000_000)  # a standard error needs two
     designs = np.stack([space.reference] + [space.start(i) for i in range(starts)])
-    kept, recomputed = (
-        evaluate(
-            agent,
-            robot,
-            designs,
-            episodes=episodes,
-            seed=seed,
-            engine="native",
-            config=EvaluationConfig(
-                recompute_constants=value, task=TaskConfig.evaluation(horizon=horizon)
-            ),
-        ).returns
-        for value in (False, True)
-    )
+    task = TaskConfig.evaluation(horizon=horizon)
+
+    def returns(recompute: bool):
+        config = EvaluationConfig(episodes=episodes, recompute_constants=recompute, task=task)
+        return evaluate(agent, robot, designs, seed=seed, engine="native", config=config).returns
+
+    kept, recomputed = returns(False), returns(True)
     difference = recomputed - kept
     return [
         {

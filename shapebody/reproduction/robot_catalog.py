@@ -56,7 +56,7 @@ def _loaded(names) -> list[Robot]:
     """The robots of these names, all shipped ones if None."""
     names = robots() if names is None else require_list("names", names, 1000)
     if not names:
-        raise ValueError("names is empty; expected at least one robot, see shapebody.robot.robot()")
+        raise ValueError("names is empty; expected at least one robot, see shapebody.robots()")
     return [load_robot(name) for name in names]
 
 
@@ -78,7 +78,7 @@ def random_bodies(robot: Robot, designs: int = 200, control_steps: int = 50, see
         share of designs whose simulation became invalid (non_finite_*, see `NativePhysics`) and
         of the others that ended more than TOPPLED_TILT degrees from upright or below
         TOPPLED_HEIGHT of their starting height (toppled_*); crossed_limits, the share with at
-        least one joint whose limits have crossed (`mjcf.ordered_ranges`).
+        least one joint whose limits have crossed (`design.export.ordered_ranges`).
     """
     space = DesignSpace(robot)
     require_integer("designs", designs, 1, 100_000)

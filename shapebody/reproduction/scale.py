@@ -52,7 +52,7 @@ def budget() -> Budget:
 
 
 def study_setting() -> dict:
-    """What `studies.design_study` takes from the budget of the scale in force."""
+    """What `design_study` takes from the budget of the scale in force."""
     one = budget()
     return dict(
         starts=one.starts,
