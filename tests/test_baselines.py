@@ -544,10 +544,10 @@ def test_bo_leaves_pytorch_as_it_was(starts):
 
 @NO_BOTORCH
 def test_bo_begins_with_the_start_and_sobol_points():
-    from shapebody.optimizers.bayesian import BOConfig, Surrogate
+    from shapebody.optimizers.bayesian import BOConfig, _Surrogate
 
     start = uniform(5)
-    points = Surrogate(start, jax.random.key(0), BOConfig(initial_points=9)).initial()
+    points = _Surrogate(start, jax.random.key(0), BOConfig(initial_points=9)).initial()
     np.testing.assert_array_equal(points[0], start)
     # Eight Sobol points have one in every eighth of every parameter's range.
     eighths = np.sort(np.floor((points[1:] + 1) * 4).astype(int), axis=0)

@@ -58,7 +58,7 @@ def bo(objective, starts, key, config: BOConfig) -> Search:
 
     starts = np.asarray(starts, np.float32)
     keys = jax.random.split(key, config.iterations + 1)
-    surrogates = [Surrogate(start, start_key(key, start), config) for start in starts]
+    surrogates = [_Surrogate(start, start_key(key, start), config) for start in starts]
     designs = [surrogate.initial() for surrogate in surrogates]
     trajectory, history = [], []
     # Not threads, which would share PyTorch's random numbers.
@@ -92,7 +92,7 @@ def bo(objective, starts, key, config: BOConfig) -> Search:
     return Search(found, trajectory, history, config.initial_points + config.iterations)
 
 
-class Surrogate:
+class _Surrogate:
     """What one start knows: its scored designs and where the last fit to them ended."""
 
     def __init__(self, start, key, config):
@@ -165,7 +165,7 @@ class Surrogate:
         return np.clip(2 * point.numpy() - 1, -1, 1).astype(np.float32)
 
 
-def _turn(surrogate: Surrogate, designs, values, last: bool):
+def _turn(surrogate: _Surrogate, designs, values, last: bool):
     """Learn from scored designs [P, d]; returns (surrogate, best design [d], next designs [1, d]).
 
     The best is the scored design with the highest posterior mean, or the start if none has a

@@ -17,8 +17,8 @@ import pandas as pd
 import pydantic
 from typing_extensions import TypedDict
 
+from shapebody.agent.agent import require_agent
 from shapebody.arguments import (
-    refuse,
     require_flag,
     require_function,
     require_kind,
@@ -190,24 +190,19 @@ def result_path(name: str) -> Path:
 def result_provenance(agent=None, seconds: float | None = None, **config) -> dict:
     """Where a result comes from: settings, scale, agent, versions, commit, machine, seconds."""
     record = {"config": config, "scale": scale(), **provenance()}
-    if agent is not None:
-        record["agent"] = {
-            "name": agent.name,
-            **_identity(agent),
-            "steps": agent.metadata.get("steps"),
-        }
+    if identity := _identity(agent):
+        steps = agent.metadata.get("steps")
+        record["agent"] = {"name": agent.name, **identity, "steps": steps}
     if seconds is not None:
         record["seconds"] = round(require_number("seconds", seconds, 0), 1)
     return record
 
 
 def _identity(agent) -> dict:
-    """What tells an agent from others; nothing of None. TypeError if it is not an agent."""
+    """What tells an agent from others; nothing for None. TypeError if it is not an `Agent`."""
     if agent is None:
         return {}
-    if not all(hasattr(agent, name) for name in ("hash", "states_hash")):
-        hint = "load it with shapebody.load_agent(...)"
-        raise refuse("agent", agent, "an Agent", hint, TypeError)
+    require_agent(agent)
     return {"hash": agent.hash, "states_hash": agent.states_hash}
 
 
@@ -290,6 +285,7 @@ class _Source(TypedDict):
     config: dict
     seconds: float
     agent: NotRequired[dict]
+    settings: NotRequired[dict]
 
 
 class _Part(TypedDict):

@@ -15,7 +15,7 @@ class Budget:
     episodes: int
     """Evaluation episodes per design, where a notebook evaluates some."""
     study_episodes: int
-    """Evaluation episodes per design of the stored design studies (`studies`)."""
+    """Evaluation episodes per design of the stored design studies (`design_study`)."""
     search_iterations: int | None
     """Iterations of their searches; None for the paper's."""
     random_designs: int
