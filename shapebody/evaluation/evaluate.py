@@ -162,7 +162,7 @@ def evaluate(
             f"one row of [S, {space.dim}]"
         )
 
-    # As many environments as there are episodes, or as few as share the work equally.
+    # One environment per episode, or equal shares of them where that exceeds `num_envs`.
     rows = np.atleast_2d(designs)
     total = len(rows) * config.episodes
     chunks = -(-total // config.num_envs)

@@ -75,8 +75,8 @@ def _read_layers(layers, numbers_file):
         start, size = layer["offset"], layer["size_bytes"]
         if size != 4 * int(np.prod(shape)) or start < 0 or start + size > len(numbers):
             raise ValueError(
-                f"{name} of shape {shape} is said to be {size} bytes from byte {start}, but "
-                f"{numbers_file} has {len(numbers)} bytes; fetch both files again"
+                f"{name} of shape {shape} should be {size} bytes from byte {start} of "
+                f"{numbers_file}, which has {len(numbers)} bytes; fetch both files again"
             )
         array = np.frombuffer(numbers, "<f4", size // 4, start).reshape(shape)
         if not np.isfinite(array).all():

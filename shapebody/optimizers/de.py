@@ -3,7 +3,7 @@
     x <- initial population, scored on the first minibatch of states
     repeat N - 1 times
         for every particle x_i
-            mutant <- a + F (b - c),   a, b, c three other particles, drawn anew
+            mutant <- a + F (b - c),   a, b, c three other particles, drawn at random
             trial <- x_i with each parameter, at least one, from the mutant with probability CR
         score the trials, clipped to [-1, 1]^d, on a new minibatch
         x_i <- its trial, where that is better

@@ -143,7 +143,7 @@ def start_key(key, start):
 def last_finite(trajectory, history):
     """The last designs [S, d] of a trajectory [N + 1, S, d] whose objective is finite.
 
-    The start, if there is none.
+    If it never is, this is the start.
     """
     rows = jnp.arange(len(history))[:, None]
     last = jnp.max(jnp.where(jnp.isfinite(history), rows, 0), axis=0)

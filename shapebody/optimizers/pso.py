@@ -9,9 +9,9 @@
         x <- clip(x + v), v <- what x has moved
 
 The paper does not say how the population begins: see `loop.initial_population`. A design that is
-kept keeps the value of the minibatch on which it was scored, as in the textbooks: the minibatch
-shifts the values of all designs alike, by little beside the differences that are still found at
-d > 300.
+kept keeps the value of the minibatch on which it was scored, as in the textbooks. A minibatch
+shifts the values of all designs by about the same, which is little compared with the differences
+that are still found at d > 300.
 """
 
 from __future__ import annotations

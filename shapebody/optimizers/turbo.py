@@ -59,7 +59,7 @@ class _TrustBox(NamedTuple):
 def turbo(objective, starts, key, config: TuRBOConfig) -> Search:
     """Uniform draws from a box around the best design, whose size adapts to success.
 
-    The centre is scored anew in every iteration, so that it is compared with the candidates on
+    The centre is scored again in every iteration, so that it is compared with the candidates on
     the same states.
     """
     evaluations = config.iterations * (config.candidates + 1)

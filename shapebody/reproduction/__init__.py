@@ -1,4 +1,4 @@
-"""The paper's numbers, and the studies beside which ours stand."""
+"""The paper's numbers, and our studies to be compared with them."""
 
 import lazy_loader
 

@@ -93,7 +93,7 @@ def design_study(
         iterations: of every search; the paper's number for each method if not given.
         first_start: number of the first start design. The paper's are 0 to 9; others have a file
             of their own.
-        recompute: search and evaluate anew, and overwrite what is stored.
+        recompute: search and evaluate again, and overwrite what is stored.
         progress: print a line per run that is computed.
 
     Returns:

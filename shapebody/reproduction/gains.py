@@ -108,7 +108,7 @@ def _row(method, over, trust_region, after: pd.Series, before: pd.Series) -> dic
     if not after.index.equals(before.index):
         raise ValueError(
             f"{method} at lambda {trust_region} has starts {list(after.index)}, {over} has "
-            f"{list(before.index)}; both need the same, compute the records anew"
+            f"{list(before.index)}; both need the same, compute the records again"
         )
     found = paired_gain(np.array(after.tolist()), np.array(before.tolist()))
     row = {"method": method, "over": over, "trust_region": trust_region}

@@ -46,7 +46,7 @@ def result(name: str, compute: Callable[[], list[dict]], agent=None, recompute=F
         name: of the experiment.
         compute: returns tidy records, a list of flat dictionaries.
         agent: the agent that the result depends on.
-        recompute: compute anew, and overwrite what is there.
+        recompute: compute again, and overwrite what is stored.
         config: settings that the result depends on.
 
     Returns:
@@ -77,7 +77,7 @@ def result_in_parts(
     Args:
         name, agent, config: see `result`.
         parts: by name, functions that return the records of one part.
-        recompute: compute these parts anew. Others stay, unless the file is another agent's or has
+        recompute: compute these parts again. Others stay, unless the file is another agent's or has
             other settings: it is then replaced.
         progress: print a line per part that is computed.
         settings: by name of the part, what this part alone depends on.
@@ -145,7 +145,7 @@ def stored_result(path) -> dict:
         FileNotFoundError: if the file does not exist.
         ValueError: if it is damaged.
     """
-    fix = "restore it, or delete it and compute it anew"
+    fix = "restore it, or delete it and compute it again"
     parts = _read(require_path("path", path), fix)
     if not parts:
         raise ValueError(f"{path} holds no parts; {fix}")

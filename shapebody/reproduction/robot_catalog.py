@@ -20,7 +20,7 @@ TOPPLED_HEIGHT = 0.5
 
 def robot_table(names: Sequence[str] | None = None) -> list[dict]:
     """One record per robot, in alphabetical order: what the paper's table of robots prints
-    (Appendix A) and what a reader wants to know beside it.
+    (Appendix A) and what a reader wants to know besides.
 
     Args:
         names: robots, all shipped ones if not given.

@@ -37,7 +37,7 @@ BUDGETS = {
     "reduced": Budget(10, 50, 50, None, 256, 8, 400_000, 6.0, 12, 1000),
     "full": Budget(10, 200, 200, None, 256, 32, 20_000_000, 10.0, 12, 1000),
 }
-"""Budgets by scale. What training changes beside sizes is in `scales_table`."""
+"""Budgets by scale. What differs in training besides sizes is in `scales_table`."""
 
 
 def scale() -> str:
