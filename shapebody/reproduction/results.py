@@ -264,11 +264,11 @@ class _File:
 
 
 def _difference(there: dict, here: dict) -> str:
-    """The first entry in which two dictionaries differ; "" if none does."""
-    for key in (*here, *there):
-        if there.get(key) != here.get(key):
-            return f"{key} is {shown(there.get(key))} there and {shown(here.get(key))} here"
-    return ""
+    """The entries in which two dictionaries differ; "" if they do not."""
+    keys = [key for key in here | there if there.get(key) != here.get(key)]
+    return ", ".join(
+        f"{key} is {shown(there.get(key))} there and {shown(here.get(key))} here" for key in keys
+    )
 
 
 def _other_settings(part: dict, settings: dict | None) -> str:
