@@ -368,7 +368,6 @@ FUNCTIONS = {
         coefficient=PROBABILITY,
         task=TASK,
         num_envs=integer(1, 10**6),
-        recompute_constants=FLAG,
     ),
     "evaluation.statistics.bootstrap_interval": dict(
         values=array(3, accepts=("array", "JAX array")),
@@ -429,14 +428,6 @@ FUNCTIONS = {
         trust_region=TRUST_REGION,
     ),
     "reproduction.scale.budget": {},
-    "reproduction.derived_constants.derived_constants": dict(
-        agent=AGENT,
-        robot=ROBOT,
-        starts=integer(0, 10**5),
-        episodes=integer(2, 10**6),
-        seed=SEED,
-        horizon=integer(1, 10**400),
-    ),
     "reproduction.results.result_provenance": dict(agent=optional(AGENT), seconds=SECONDS),
     "evaluation.statistics.rank_correlation": dict(
         x=array(4, right=[1.0, 2.0, 3.0]),

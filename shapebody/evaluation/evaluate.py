@@ -14,7 +14,7 @@ import numpy as np
 
 from shapebody.agent.agent import Agent, require_agent
 from shapebody.arguments import require_engine, require_flag, require_kind, require_seed
-from shapebody.configuration import Flag, configuration, integer, number
+from shapebody.configuration import configuration, integer, number
 from shapebody.design.space import DesignSpace
 from shapebody.evaluation.statistics import (
     CONFIDENCE,
@@ -47,9 +47,6 @@ class EvaluationConfig:
     """Settings of the task."""
     num_envs: Episodes = 512
     """Largest number of episodes that run side by side."""
-    recompute_constants: Flag = False
-    """Native engine: recompute MuJoCo's derived constants for every design, instead of keeping
-    the reference's as the paper's environment does."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -167,7 +164,7 @@ def evaluate(
     total = len(rows) * config.episodes
     chunks = -(-total // config.num_envs)
     size = -(-total // chunks)
-    env = _environment(robot, size, engine, config.task, config.recompute_constants)
+    env = _environment(robot, size, engine, config.task)
 
     # All episodes of all designs, and their results as [S, E].
     keys = np.asarray(_episode_keys(seed, config.episodes))
@@ -345,20 +342,8 @@ def _embed(config: PolicyConfig):
 
 
 @functools.lru_cache(maxsize=4)
-def _environment(
-    robot: Robot,
-    num_envs: int,
-    engine: str,
-    task: TaskConfig,
-    recompute_constants: bool = False,
-) -> Locomotion:
-    options = {"recompute_constants": True} if recompute_constants else None
-    native = engine == "native" or (engine == "auto" and jax.default_backend() == "cpu")
-    if recompute_constants and not native:
-        raise ValueError(
-            "recompute_constants is True; expected False, or engine='native', which alone can do it"
-        )
-    return Locomotion(robot, num_envs, engine, task, auto_reset=False, physics_options=options)
+def _environment(robot: Robot, num_envs: int, engine: str, task: TaskConfig) -> Locomotion:
+    return Locomotion(robot, num_envs, engine, task, auto_reset=False)
 
 
 @functools.partial(jax.jit, static_argnums=1)
