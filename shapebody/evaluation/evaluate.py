@@ -13,7 +13,12 @@ import jax.numpy as jnp
 import numpy as np
 
 from shapebody.agent.agent import Agent, require_agent
-from shapebody.arguments import require_engine, require_flag, require_kind, require_seed
+from shapebody.arguments import (
+    require_engine,
+    require_flag,
+    require_kind,
+    require_seed,
+)
 from shapebody.configuration import configuration, integer, number
 from shapebody.design.space import DesignSpace
 from shapebody.evaluation.statistics import (
@@ -165,10 +170,10 @@ def evaluate(
     chunks = -(-total // config.num_envs)
     size = -(-total // chunks)
     env = _environment(robot, size, engine, config.task)
-
-    # All episodes of all designs, and their results as [S, E].
     keys = np.asarray(_episode_keys(seed, config.episodes))
     work = _Work(rows, keys, config, progress)
+
+    # All episodes of all designs, and their results as [S, E].
     began = time.perf_counter()
     results = _queued(env, agent, work) if env.engine == "native" else _chunked(env, agent, work)
     if progress:
