@@ -275,9 +275,9 @@ def main():
         enable_compilation_cache()
         print(json.dumps(BENCHMARKS[options.names[0]]()))
         return
-    from shapebody.reproduction.results import provenance
+    from shapebody.reproduction.results import result_provenance
 
-    source = provenance(robot=ROBOT, environments=ENVIRONMENTS)
+    source = result_provenance(robot=ROBOT, environments=ENVIRONMENTS)
     for name in options.names or BENCHMARKS:
         environment = dict(os.environ)
         if name in ("training", "fifty"):

@@ -6,6 +6,7 @@ new public function without an entry fails the test.
 """
 
 import numpy as np
+import pandas as pd
 from arguments import (
     AGENT,
     AGENT_FOLDER,
@@ -94,6 +95,12 @@ UNCHECKED = {
     "rotations.quaternion_product": FORMULA,
     "evaluation.evaluate.Evaluation": RESULT,
     "evaluation.statistics.Gain": RESULT,
+    "evaluation.statistics.float_or_array": "takes what was computed here",
+    "reproduction.design_study.evaluation_config": "`EvaluationConfig` looks at the arguments",
+    "reproduction.design_study.part_name": "takes a run that `design_study` has looked at",
+    "reproduction.design_study.require_counts": "a check itself",
+    "reproduction.design_study.search_settings": "takes runs that `design_study` has looked at",
+    "design.space.DesignSpace.as_float32": "a check itself, called by `Objective` and `validate`",
     "reproduction.scale.Budget": "a row of BUDGETS",
     "task.env.StepRecord": RESULT,
     "task.env.Trajectory": RESULT,
@@ -109,6 +116,9 @@ UNCHECKED = {
     "networks.policy.Policy.act": INSIDE,
     "networks.policy.Policy.embed": INSIDE,
     "networks.urma.WeightNormDense": INSIDE,
+    "networks.inputs.Standardized": INSIDE,
+    "networks.inputs.identity": "takes an entry of INPUT_SIZES",
+    "networks.inputs.join": FORMULA,
     "networks.urma.aggregate": FORMULA,
     "networks.urma.elu": FORMULA,
     "networks.policy.entropy": FORMULA,
@@ -131,6 +141,8 @@ UNCHECKED = {
     "optimizers.loop.score": METHOD,
     "optimizers.loop.start_key": METHOD,
     "optimizers.loop.values_and_gradients": METHOD,
+    "optimizers.gc_pfo.move": METHOD,
+    "optimizers.objective.mean_value": "called by `Objective`, inside compiled code",
     "optimizers.search.Method": "a row of METHODS",
     "optimizers.search.SearchResult": RESULT,
     "optimizers.objective.DesignCritic": "made by `design_critic`",
@@ -357,7 +369,6 @@ FUNCTIONS = {
         coefficient=PROBABILITY,
         task=TASK,
         num_envs=integer(1, 10**6),
-        recompute_constants=FLAG,
     ),
     "evaluation.statistics.bootstrap_interval": dict(
         values=array(3, accepts=("array", "JAX array")),
@@ -418,20 +429,15 @@ FUNCTIONS = {
         trust_region=TRUST_REGION,
     ),
     "reproduction.scale.budget": {},
-    "reproduction.derived_constants.derived_constants": dict(
-        agent=AGENT,
-        robot=ROBOT,
-        starts=integer(0, 10**5),
-        episodes=integer(2, 10**6),
-        seed=SEED,
-        horizon=integer(1, 10**400),
-    ),
     "reproduction.results.result_provenance": dict(agent=optional(AGENT), seconds=SECONDS),
     "evaluation.statistics.rank_correlation": dict(
         x=array(4, right=[1.0, 2.0, 3.0]),
         y=array(4, right=[1.0, 2.0, 3.0]),
-        resamples=integer(1, 10**6),
+        resamples=integer(2, 10**6),
         seed=SEED,
+    ),
+    "reproduction.results.frame": dict(
+        records=RECORDS.also("list", "empty array", why="a table without rows")
     ),
     "reproduction.results.result": dict(
         name=NAME, compute=FUNCTION, agent=optional(AGENT), recompute=FLAG
@@ -934,7 +940,7 @@ FUNCTIONS = {
     "reproduction.design_study.available": STUDY,
     "reproduction.design_study.design_study": STUDY | dict(progress=FLAG),
     "reproduction.gains.gain": dict(
-        rows=RECORDS,
+        rows=thing(lambda world: pd.DataFrame(world.records)),
         method=choice("none"),
         over=choice("start"),
         trust_region=optional(choice(1.0)),

@@ -18,7 +18,7 @@ from shapebody.optimizers.ars import ARSConfig, ars
 from shapebody.optimizers.cem import CEMConfig, cem
 from shapebody.optimizers.cma_es import CMAESConfig, cma_es
 from shapebody.optimizers.de import DEConfig, de
-from shapebody.optimizers.gc_pfo import GCPFOConfig, _move
+from shapebody.optimizers.gc_pfo import GCPFOConfig, move
 from shapebody.optimizers.loop import start_key
 from shapebody.optimizers.objective import Objective
 from shapebody.optimizers.pso import PSOConfig, pso
@@ -480,7 +480,7 @@ def test_gc_pfo_explores_along_the_gradients():
     config, size = GCPFOConfig(particles=400), 5
     particles = jnp.zeros((400, size))
     gradients = jnp.tile(jnp.array([3.0, -4.0, 0, 0, 0]), (400, 1))
-    moved = np.asarray(_move(config, 1.0, particles, jnp.zeros(400), gradients, jax.random.key(0)))
+    moved = np.asarray(move(config, 1.0, particles, jnp.zeros(400), gradients, jax.random.key(0)))
     # All gradients are parallel, so all noise is too, to both sides, with the given size.
     np.testing.assert_allclose(moved[:, 2:], 0, atol=1e-6)
     inside = np.abs(moved).max(1) < 1
@@ -494,7 +494,7 @@ def test_gc_pfo_noise_has_the_covariance_of_the_gradients():
     config, count = GCPFOConfig(particles=4000, step_size=0.05), 4000
     rng = np.random.default_rng(0)
     gradients = rng.normal(size=(count, 3)) @ np.array([[1, 0.5, 0], [0, 0.7, 0], [0, 0, 0.2]])
-    moved = _move(
+    moved = move(
         config,
         1.0,
         jnp.zeros((count, 3)),
@@ -515,7 +515,7 @@ def test_gc_pfo_resamples_by_value():
     still = jnp.zeros_like(particles)
     spread = []
     for left in (1.0, 0.1, 0.0):
-        chosen = _move(GCPFOConfig(), left, particles, values, still, jax.random.key(0))
+        chosen = move(GCPFOConfig(), left, particles, values, still, jax.random.key(0))
         assert np.all(chosen > particles[4]), "a particle without a value survived"
         spread.append(float(jnp.std(chosen)))
     assert spread[0] > spread[1] > spread[2] == 0

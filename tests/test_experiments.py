@@ -10,12 +10,13 @@ from shapebody.reproduction import results as reproduction_results
 
 
 class Known(Agent):
-    """An agent of which nothing is there but what tells it from others."""
+    """An agent that has nothing but what tells it from others."""
 
-    hash, states_hash = None, "56"
+    hash, states_hash = None, None
 
-    def __init__(self, hash):
-        for name, value in {"name": "a", "metadata": {"steps": 7}, "hash": hash}.items():
+    def __init__(self, hash, states_hash="56"):
+        known = dict(name="a", metadata={"steps": 7}, hash=hash, states_hash=states_hash)
+        for name, value in known.items():
             object.__setattr__(self, name, value)
 
 
@@ -71,19 +72,30 @@ def test_result_is_computed_once_and_loaded_afterwards(results):
     assert first["provenance"]["agent"] == source
 
 
-def test_result_of_another_agent_or_setting_is_computed_anew(results):
-    compute = Computation()
+@pytest.mark.parametrize(
+    "agent, setting, difference",
+    [
+        (AGENT, {"starts": 3}, "starts is 2 there and 3 here"),
+        (AGENT, {"starts": 2, "seed": 1}, "seed is None there and 1 here"),
+        (Known("5678"), {"starts": 2}, "its agent's hash is '1234' there and '5678' here"),
+        (Known("1234", "57"), {"starts": 2}, "its agent's states_hash is '56' there and '57'"),
+    ],
+)
+def test_a_file_of_another_agent_or_setting_is_overwritten_on_request_only(
+    results, agent, setting, difference
+):
+    compute, path = Computation(), results / "x.json"
     reproduction_results.result("x", compute, AGENT, starts=2)
-    reproduction_results.result("x", compute, AGENT, starts=3)
-    other = Known("5678")
-    stored = reproduction_results.result("x", compute, other, starts=3)
-    assert compute.calls == 3
-    assert stored["provenance"]["agent"]["hash"] == "5678"
-    other.states_hash = "57"
-    reproduction_results.result("x", compute, other, starts=3)
-    assert compute.calls == 4
-    reproduction_results.result("x", compute, other, recompute=True, starts=3)
-    assert compute.calls == 5
+    before = path.read_bytes()
+    with pytest.raises(ValueError, match=f"x.json .*{difference}.*recompute=True"):
+        reproduction_results.result("x", compute, agent, **setting)
+    assert compute.calls == 1 and path.read_bytes() == before
+    assert reproduction_results.stored_parts("x", agent, **setting) == []
+    reproduction_results.result("x", compute, agent, recompute=True, **setting)
+    again = reproduction_results.result("x", compute, agent, **setting)
+    assert compute.calls == 2 and again["records"] == [{"call": 2}]
+    assert again["provenance"]["agent"]["hash"] == agent.hash
+    assert [path.name for path in results.iterdir()] == ["x.json"]
 
 
 def test_full_scale_has_its_own_file(results, monkeypatch):
@@ -143,29 +155,56 @@ def test_parts_are_stored_one_by_one_and_an_interruption_keeps_them(results):
     assert len(reproduction_results.result_in_parts("x", three, AGENT, starts=2)["records"]) == 2
     assert list(json.loads((results / "x.json").read_text())["parts"]) == ["one", "two", "three"]
     assert one.calls == 1
-    # Other settings make all parts another result. The old ones are kept beside it.
-    before = (results / "x.json").read_text()
-    reproduction_results.result_in_parts("x", {"one": one, "two": two}, AGENT, starts=3)
-    assert list(json.loads((results / "x.json").read_text())["parts"]) == ["one", "two"]
-    assert (one.calls, two.calls) == (2, 2)
-    assert (results / "x.old.json").read_text() == before
-    reproduction_results.result_in_parts("x", {"one": one}, AGENT, starts=2)
-    assert (results / "x.old.json").read_text() == before
-    assert "one" in json.loads((results / "x.old2.json").read_text())["parts"]
+    # Anew, a part takes the place of its old records; the others stay.
+    again = reproduction_results.result_in_parts("x", {"one": one}, AGENT, recompute=True, starts=2)
+    assert again["records"] == [{"call": 2}] and (one.calls, two.calls) == (2, 1)
+    assert list(json.loads((results / "x.json").read_text())["parts"]) == ["one", "two", "three"]
+    # With other settings, the whole file is replaced.
+    reproduction_results.result_in_parts("x", {"one": one}, AGENT, recompute=True, starts=3)
+    assert list(json.loads((results / "x.json").read_text())["parts"]) == ["one"]
 
 
-def test_a_part_of_other_settings_of_its_own_is_computed_anew(results):
+def test_a_part_of_other_settings_of_its_own_is_refused(results):
     one, two = Computation(), Computation()
     parts = {"one": one, "two": two}
-    for settings in ({"one": {"rate": (1, 2)}}, {"one": {"rate": (1, 2)}}, {"one": {"rate": 3}}):
-        before = (results / "x.json").read_text() if (results / "x.json").exists() else None
+    for _ in range(2):
+        settings = {"one": {"rate": (1, 2)}}
         reproduction_results.result_in_parts("x", parts, AGENT, settings=settings)
+    assert (one.calls, two.calls) == (1, 1)
+    settings = {"one": {"rate": 3}}
+    with pytest.raises(ValueError, match=r"'one' in .*: rate is \[1, 2\] there and 3 here; delete"):
+        reproduction_results.result_in_parts("x", parts, AGENT, settings=settings)
+    assert reproduction_results.stored_parts("x", AGENT, settings) == ["two"]
+    reproduction_results.result_in_parts(
+        "x", {"one": one}, AGENT, recompute=True, settings=settings
+    )
     assert (one.calls, two.calls) == (2, 1)
-    assert (results / "x.old.json").read_text() == before, "the other result is kept"
     stored = json.loads((results / "x.json").read_text())["parts"]
     assert stored["one"]["provenance"]["settings"] == {"rate": 3}
-    assert reproduction_results.stored_parts("x", AGENT, {"one": {"rate": 3}}) == ["two", "one"]
+    assert reproduction_results.stored_parts("x", AGENT, settings) == ["one", "two"]
     assert reproduction_results.stored_parts("x", AGENT, {"one": {"rate": 4}}) == ["two"]
+
+
+def test_another_process_of_another_agent_is_not_overwritten(results):
+    def meanwhile():
+        reproduction_results.result("x", Computation(), Known("5678"))
+        return [{"a": 1}]
+
+    with pytest.raises(ValueError, match="x.json is of another result"):
+        reproduction_results.result("x", meanwhile, AGENT)
+    assert reproduction_results.stored_parts("x", Known("5678")) == ["all"]
+
+
+def test_a_table_has_a_row_per_record(results):
+    study = reproduction_results.result("x", lambda: synthetic(), AGENT)
+    table = reproduction_results.frame(study)
+    assert len(table) == len(study["records"]) and list(table) == list(study["records"][0])
+    vgds = table.query("method == 'vgds' and trust_region == 20 and origin == 'start'")
+    assert vgds["return"].tolist() == [7.0, 9.0, 8.0]
+    assert table[table["method"] == "penalty-only"]["trust_region"].isna().all()
+    assert reproduction_results.frame(table) is table
+    assert reproduction_results.frame(study["records"]).equals(table)
+    assert gains.gains(table).equals(gains.gains(study["records"]))
 
 
 # gains
@@ -230,6 +269,8 @@ def test_rank_correlation_agrees_with_scipy():
     rho, low, high = statistics.rank_correlation(x, y)
     assert rho == pytest.approx(spearmanr(x, y).statistic)
     assert low < rho < high
+    # The resamples of before, with which notebooks and stored results were made.
+    assert (low, high) == pytest.approx((0.40836090202, 0.74857323868), abs=1e-9)
     assert statistics.rank_correlation(x, np.exp(x))[0] == pytest.approx(1)
     assert np.isnan(statistics.rank_correlation(x, np.ones(60))[0])
     with pytest.raises(ValueError, match="three or more"):

@@ -203,9 +203,9 @@ def test_slices_of_the_bank_give_the_same_mean(agent, robot, starts, monkeypatch
     objective = Objective.of(agent, robot)
     whole = np.asarray(objective(starts))
     monkeypatch.setattr(optimizers_objective, "MAX_ROWS", 3 * 7)
-    optimizers_objective._mean_value.clear_cache()
+    optimizers_objective.mean_value.clear_cache()
     np.testing.assert_allclose(objective(starts), whole, atol=1e-5)
-    optimizers_objective._mean_value.clear_cache()
+    optimizers_objective.mean_value.clear_cache()
 
 
 def test_gradient_against_finite_differences(agent, robot, space):

@@ -22,11 +22,17 @@ from shapebody.reproduction import design_study as reproduction_design_study
 from shapebody.reproduction import gains as reproduction_gains
 from shapebody.reproduction import results as reproduction_results
 from shapebody.reproduction import scale as reproduction_scale
-from shapebody.reproduction.design_study import CONTROL, Run, design_study
+from shapebody.reproduction.design_study import (
+    PENALTY_ONLY,
+    Run,
+    available,
+    design_study,
+    installed,
+)
 from shapebody.robot.robot import load_robot
 from shapebody.task.config import TaskConfig
 
-RUNS = (CONTROL, Run("vgds", 20.0), Run("cem"), Run("vgds", 100.0, "reference"))
+RUNS = (PENALTY_ONLY, Run("vgds", 20.0), Run("cem"), Run("vgds", 100.0, "reference"))
 SETTING = dict(starts=2, episodes=3, horizon=12, iterations=2)
 
 
@@ -63,10 +69,10 @@ def test_runs_are_the_papers():
     assert {run.method for run in reproduction_design_study.METHOD_RUNS} == set(METHODS)
     assert {run.trust_region for run in reproduction_design_study.METHOD_RUNS} == {None, 100.0}
     assert (
-        CONTROL in reproduction_design_study.METHOD_RUNS
-        and CONTROL in reproduction_design_study.TRUST_REGION_RUNS
+        PENALTY_ONLY in reproduction_design_study.METHOD_RUNS
+        and PENALTY_ONLY in reproduction_design_study.TRUST_REGION_RUNS
     )
-    assert reproduction_design_study.installed((CONTROL, Run("cem"))) == (CONTROL, Run("cem"))
+    assert installed(RUNS[:3]) == RUNS[:3]
 
 
 def test_records_are_what_search_and_evaluation_give(results, agent, robot):
@@ -111,9 +117,7 @@ def test_records_are_what_search_and_evaluation_give(results, agent, robot):
     assert reproduction_gains.gain(rows, "cem", "penalty-only", 100.0)["pairs"] == 2
 
 
-@pytest.mark.skipif(
-    not reproduction_design_study.installed((Run("bo"),)), reason="BoTorch is not installed"
-)
+@pytest.mark.skipif(not installed((Run("bo"),)), reason="BoTorch is not installed")
 def test_evaluations_along_the_curve_of_bo(results, agent, robot):
     """BO has scored its first points before its first iteration."""
     records = design_study(agent, robot, (Run("bo"),), **dict(SETTING, starts=1))["records"]
@@ -152,15 +156,17 @@ def test_a_study_of_more_episodes_is_used_and_completed_with_as_many(results, ag
     assert again["records"][0]["returns"] == first["records"][0]["returns"]
     stored = results / f"design_study_{robot.name}_{robot.hash}.json"
     # More episodes than stored, or other starts, are another study.
-    more = design_study(agent, robot, RUNS[:1], **dict(SETTING, episodes=4))
+    for other in (dict(SETTING, episodes=4), dict(fewer, starts=1)):
+        with pytest.raises(ValueError, match="(episodes|starts) is . there and . here"):
+            design_study(agent, robot, RUNS[:1], **other)
+    more = dict(SETTING, episodes=4)
+    more = design_study(agent, robot, RUNS[:1], recompute=True, **more)
     assert {len(record["returns"]) for record in more["records"]} == {4}
-    assert [path.name for path in results.glob("*.old.json")] == [stored.stem + ".old.json"]
-    other = design_study(agent, robot, RUNS[:1], **dict(fewer, starts=1))
-    assert {len(record["returns"]) for record in other["records"]} == {2}
+    assert [path.name for path in results.iterdir()] == [stored.name]
 
 
 def test_other_starts_have_their_own_file(results, agent, robot):
-    runs = (CONTROL, Run("vgds", 20.0))
+    runs = (PENALTY_ONLY, Run("vgds", 20.0))
     own = design_study(agent, robot, runs, **dict(SETTING, starts=3))["records"]
     path = results / f"design_study_{robot.name}_{robot.hash}.json"
     before = path.read_bytes()
@@ -199,7 +205,7 @@ def test_other_starts_have_their_own_file(results, agent, robot):
 )
 def test_a_run_that_cannot_be_stops_before_the_first(results, agent, robot, run, message):
     with pytest.raises(ValueError, match=message):
-        design_study(agent, robot, (CONTROL, run), **SETTING)
+        design_study(agent, robot, (PENALTY_ONLY, run), **SETTING)
     with pytest.raises(ValueError, match="starts is 0; expected an integer of at least 1"):
         design_study(agent, robot, RUNS, **dict(SETTING, starts=0))
     with pytest.raises(ValueError, match="iterations is 0; expected an integer of at least 1"):
@@ -228,30 +234,25 @@ def test_gains_refuse_two_engines(results, agent, robot):
 
 
 def test_available_runs_are_installed_or_stored(results, agent, robot, monkeypatch):
-    runs = (CONTROL, Run("bo"), Run("vgds", 20.0))
+    runs = (PENALTY_ONLY, Run("bo"), Run("vgds", 20.0))
     monkeypatch.setattr(
         reproduction_design_study,
         "installed",
         lambda runs: tuple(run for run in runs if run.method != "bo"),
     )
-    assert reproduction_design_study.available(agent, robot, runs, **SETTING) == (CONTROL, runs[2])
+    assert available(agent, robot, runs, **SETTING) == runs[::2]
     monkeypatch.setattr(
         reproduction_design_study,
         "search",
         lambda method, *rest, **options: search("random", *rest, **options),
     )
     design_study(agent, robot, runs[1:2], **SETTING)
-    assert reproduction_design_study.available(agent, robot, runs, **SETTING) == runs
-    assert (
-        reproduction_design_study.available(agent, robot, runs, **dict(SETTING, episodes=2)) == runs
-    )
+    assert available(agent, robot, runs, **SETTING) == runs
+    assert available(agent, robot, runs, **dict(SETTING, episodes=2)) == runs
     for other in (dict(SETTING, starts=3), dict(SETTING, recompute=True)):
-        assert reproduction_design_study.available(agent, robot, runs, **other) == (
-            CONTROL,
-            runs[2],
-        )
+        assert available(agent, robot, runs, **other) == runs[::2]
     monkeypatch.setenv("SHAPEBODY_SCALE", "smoke")
-    assert reproduction_design_study.available(agent, robot, runs, **SETTING) == (CONTROL, runs[2])
+    assert available(agent, robot, runs, **SETTING) == runs[::2]
 
 
 def interval(gain, digits=1):
@@ -336,7 +337,7 @@ def test_readme_states_the_stored_results():
     alone = parts["golem"]["size only"]
     assert alone.low < 0 < alone.high
 
-    assert "at λ = 0, VGDS makes the MIT Humanoid and the Golem worse than the penalty" in text
+    assert "at λ = 0, VGDS makes the MIT Humanoid and the Golem worse than penalty only" in text
     for name in ("mit_humanoid", "golem"):
         path = data_dir() / "results" / f"design_study_{name}.json"
         rows = reproduction_gains.gains(reproduction_results.stored_result(path)["records"])
@@ -354,7 +355,7 @@ def test_readme_states_the_example_and_the_mean():
     one = [found[method][3] for method in ("none", "vgds", "penalty-only")]
     ten = [np.mean(list(found[method].values())) for method in ("none", "vgds", "penalty-only")]
     for start, end, alone, words in (
-        (*one, "{:.1f} to {:.1f} (penalty alone: {:.1f})"),
+        (*one, "{:.1f} to {:.1f} (penalty only: {:.1f})"),
         (*ten, "over ten starts from {:.1f} to {:.1f} ({:.1f})"),
     ):
         assert words.format(start, end, alone) in text
@@ -441,15 +442,15 @@ def test_stored_studies_are_whole(name, episodes):
     if name == "mit_humanoid":
         runs = tuple(run for run in runs if run.method != "bo")
     setting = dict(starts=10, episodes=episodes, horizon=1000)
-    assert reproduction_design_study.available(agent, robot, runs, **setting) == runs
+    assert available(agent, robot, runs, **setting) == runs
     stored = reproduction_results.stored_parts(
         f"design_study_{name}",
         agent,
-        reproduction_design_study._searches(runs, {}),
+        reproduction_design_study.search_settings(runs),
         **setting,
         seed=0,
     )
-    assert {reproduction_design_study._part(run) for run in runs} <= set(stored)
+    assert {reproduction_design_study.part_name(run) for run in runs} <= set(stored)
 
 
 def test_size_share_takes_the_found_designs_apart(agent, robot, monkeypatch):
@@ -460,7 +461,7 @@ def test_size_share_takes_the_found_designs_apart(agent, robot, monkeypatch):
         walked.append(designs)
         return evaluate(agent, robot, designs, **rest)
 
-    monkeypatch.setattr(reproduction_design_study, "evaluate", seen)
+    monkeypatch.setattr(value_studies, "evaluate", seen)
     records = value_studies.size_share(agent, robot, **setting)
     kinds = ("all", "size only", "all but size")
     expected = [("reference", None), *((kind, i) for kind in kinds for i in range(2))]

@@ -1,4 +1,4 @@
-"""Whether a found body is worth building: the questions that a gain in return leaves open."""
+"""Whether a found body is worth building: what a gain in return does not say."""
 
 import jax
 import numpy as np
@@ -20,7 +20,7 @@ def large_changes(space: DesignSpace, f, limit: float = LARGE_CHANGE) -> list[st
     in the nominal pose; `limit` is a share of the reference's value.
 
     Raises:
-        ValueError: for a design that is none of this space.
+        ValueError: if f is not a design of this space.
     """
     require_kind("space", space, DesignSpace, "shapebody.DesignSpace(robot)")
     require_number("limit", limit, 0)
@@ -45,7 +45,7 @@ def objections(walked: Evaluation, stood: Evaluation, row: int, reference: int =
     """What the episodes say against building design `row`, one sentence each; empty if nothing.
 
     A design has to earn more than the body that it would replace, and more than standing still with
-    either of the two; it must neither track worse nor last less long.
+    either of the two. It must not track worse, and not fall earlier.
 
     Args:
         walked: episodes of the policy on the designs [S].
@@ -53,7 +53,7 @@ def objections(walked: Evaluation, stood: Evaluation, row: int, reference: int =
         row, reference: numbers of the design, and of the body that it would replace.
 
     Raises:
-        ValueError: if the two evaluations had other seeds or settings.
+        ValueError: if the two evaluations differ in seed or settings.
     """
     for name, value in (("walked", walked), ("stood", stood)):
         require_kind(name, value, Evaluation, "shapebody.evaluate(...)")

@@ -110,7 +110,7 @@ class DesignSpace:
 
     def validate(self, f) -> np.ndarray:
         """Return f as float32 [..., d]; ValueError if its length, finiteness or box is wrong."""
-        f = self._float32(f, np)
+        f = self.as_float32(f, np)
         if not np.all(np.isfinite(f)):
             where = np.argwhere(~np.isfinite(f))[0]
             raise ValueError(
@@ -125,7 +125,7 @@ class DesignSpace:
             )
         return f
 
-    def _float32(self, f, numpy):
+    def as_float32(self, f, numpy):
         """Designs [..., d] as float32, an array of `numpy` (or jax.numpy: also a traced one)."""
         if not isinstance(f, jax.Array):
             try:
@@ -146,7 +146,7 @@ class DesignSpace:
 
     def __call__(self, f) -> Embodiment:
         """Φ(f): embodiment of designs f [..., d]."""
-        f = self._float32(f, jnp)
+        f = self.as_float32(f, jnp)
         function = self._jitted
         for _ in range(f.ndim - 1):
             function = jax.vmap(function)

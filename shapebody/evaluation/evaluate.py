@@ -1,4 +1,4 @@
-"""Returns of designs: rollouts of the frozen policy, and the statistics of comparing designs."""
+"""Returns of designs: rollouts of the frozen policy, the same episodes with every design."""
 
 from __future__ import annotations
 
@@ -19,17 +19,22 @@ from shapebody.arguments import (
     require_kind,
     require_seed,
 )
-from shapebody.configuration import Flag, configuration, integer, number
+from shapebody.configuration import configuration, integer, number
 from shapebody.design.space import DesignSpace
-from shapebody.evaluation.statistics import CONFIDENCE, MOST_EPISODES, _out, bootstrap_interval
+from shapebody.evaluation.statistics import (
+    CONFIDENCE,
+    MOST_EPISODES,
+    bootstrap_interval,
+    float_or_array,
+)
 from shapebody.networks.config import PolicyConfig
 from shapebody.networks.policy import Policy
 from shapebody.robot.robot import Robot
 from shapebody.task.config import TaskConfig
 from shapebody.task.env import RESET_SLOTS, Locomotion
 
-_CALLS = 50  # control steps between reports, and per call of an engine that runs whole rollouts
-
+_CALLS = 50
+"""Control steps between two reports, and per call of an engine that runs whole rollouts."""
 
 Episodes = integer(1, MOST_EPISODES)
 Coefficient = number("a number from 0 to 1", ge=0, le=1)
@@ -47,9 +52,6 @@ class EvaluationConfig:
     """Settings of the task."""
     num_envs: Episodes = 512
     """Largest number of episodes that run side by side."""
-    recompute_constants: Flag = False
-    """Native engine: recompute MuJoCo's derived constants for every design, instead of keeping
-    the reference's as the paper's environment does."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,33 +59,31 @@ class Evaluation:
     """Episodes of the frozen policy on one design ([E]) or on S designs ([S, E]).
 
     Column i of every design is the same episode: same commands, initial state, noise and pushes.
-
-    Attributes:
-        returns: float32, undiscounted sum of rewards until the episode ended.
-        tracking_error: float32, mean over time and both axes of |v_xy - c_xy| in m/s, where each
-            term counts as at most twice the command limit.
-        lengths: int32, control steps.
-        finite: bool, False where the simulation became invalid, which ended the episode.
-        seconds: wall time of the rollouts.
-        settings: robot, agent, engine, seed and the evaluation's configuration.
     """
 
     returns: np.ndarray
+    """float32, undiscounted sum of rewards until the episode ended."""
     tracking_error: np.ndarray
+    """float32, mean over time and both axes of |v_xy - c_xy| in m/s, where each term counts as at
+    most twice the command limit."""
     lengths: np.ndarray
+    """int32, control steps."""
     finite: np.ndarray
+    """bool, False where the simulation became invalid, which ended the episode."""
     seconds: float
+    """Wall time of the rollouts."""
     settings: dict
+    """Robot, agent, engine, seed and the evaluation's configuration."""
 
     @property
     def mean(self):
         """Mean return per design, a float or [S]."""
-        return _out(self.returns.mean(-1))
+        return float_or_array(self.returns.mean(-1))
 
     @property
     def mean_tracking_error(self):
         """Mean tracking error per design in m/s, a float or [S]."""
-        return _out(self.tracking_error.mean(-1))
+        return float_or_array(self.tracking_error.mean(-1))
 
     @property
     def non_finite(self):
@@ -140,13 +140,14 @@ def evaluate(
         engine: "native", "mjx" or "auto" (native on a CPU). Besides the arithmetic, their solvers
             differ: "mjx" stops after 4 Newton and 8 line-search iterations (`MjxPhysics`),
             "native" after those of the robot's file.
-        config: everything else.
-        progress: print how far it is.
+        config: all other settings.
+        progress: print the share of the episodes that is done.
 
     Raises:
         ValueError: for designs of a wrong length, outside the box or not finite, a wrong number
-            of episodes, an unknown engine.
+            of episodes, or an unknown engine.
     """
+    # What is asked for.
     require_agent(agent)
     config = EvaluationConfig() if config is None else config
     require_kind("config", config, EvaluationConfig, "shapebody.EvaluationConfig(...)")
@@ -162,13 +163,17 @@ def evaluate(
             f"designs have shape {designs.shape}; expected one design [{space.dim}] or at least "
             f"one row of [S, {space.dim}]"
         )
+
+    # One environment per episode, or equal shares of them where that exceeds `num_envs`.
     rows = np.atleast_2d(designs)
     total = len(rows) * config.episodes
     chunks = -(-total // config.num_envs)
     size = -(-total // chunks)
-    env = _environment(robot, size, engine, config.task, config.recompute_constants)
+    env = _environment(robot, size, engine, config.task)
     keys = np.asarray(_episode_keys(seed, config.episodes))
     work = _Work(rows, keys, config, progress)
+
+    # All episodes of all designs, and their results as [S, E].
     began = time.perf_counter()
     results = _queued(env, agent, work) if env.engine == "native" else _chunked(env, agent, work)
     if progress:
@@ -238,6 +243,7 @@ class _Work:
 
 def _queued(env: Locomotion, agent: Agent, work: _Work) -> _Episodes:
     """Native engine: an environment whose episode has ended takes the next one."""
+    # The first episodes, one in every environment.
     policy, embed = _policy(agent.policy_config), _embed(agent.policy_config)
     results = work.empty()
     number = np.arange(env.num_envs)  # the episode in each environment
@@ -248,13 +254,14 @@ def _queued(env: Locomotion, agent: Agent, work: _Work) -> _Episodes:
     running = np.ones(env.num_envs, bool)
     step = 0
     while running.any():
+        # One control step, and the results of the episodes that it ended.
         state, record, _ = env.step(policy, params, state, key, running)
         ended = running & (record.terminated | record.truncated)
         _store(results, number[ended], record, ended)
         running &= ~ended
         left = work.total - following
         idle = np.flatnonzero(~running)[:left]
-        # Starting an episode is compiled for several at once, so some wait for each other.
+        # The next episodes. Their start is compiled for several at once, so some wait for others.
         if left and len(idle) >= min(RESET_SLOTS, left, env.num_envs):
             number[idle] = np.arange(following, following + len(idle))
             following += len(idle)
@@ -340,21 +347,8 @@ def _embed(config: PolicyConfig):
 
 
 @functools.lru_cache(maxsize=4)
-def _environment(
-    robot: Robot,
-    num_envs: int,
-    engine: str,
-    task: TaskConfig,
-    recompute_constants: Flag = False,
-) -> Locomotion:
-    options = {"recompute_constants": True} if recompute_constants else None
-    native = engine == "native" or (engine == "auto" and jax.default_backend() == "cpu")
-    if recompute_constants and not native:
-        raise ValueError(
-            "recompute_constants is True, which only the native engine can do; pass "
-            "engine='native', or leave it False"
-        )
-    return Locomotion(robot, num_envs, engine, task, auto_reset=False, physics_options=options)
+def _environment(robot: Robot, num_envs: int, engine: str, task: TaskConfig) -> Locomotion:
+    return Locomotion(robot, num_envs, engine, task, auto_reset=False)
 
 
 @functools.partial(jax.jit, static_argnums=1)

@@ -1,6 +1,6 @@
 """One episode of the frozen policy, control step by control step: for videos and for close looks.
 
-Where `evaluation` keeps one number per episode, a `Recording` keeps everything.
+`evaluate` keeps a few numbers of every episode; a `Recording` keeps everything of one.
 """
 
 from __future__ import annotations
@@ -30,33 +30,30 @@ from shapebody.task.sensors import Readings
 
 @dataclass(frozen=True, eq=False)
 class Recording:
-    """T control steps of one robot; NumPy arrays, row t belongs to control step t.
-
-    Attributes:
-        qpos: float64 [T, nq], positions at the beginning of the step.
-        observation: what the networks saw, with leading axis T.
-        action: float32 [T, J], mean actions of the policy.
-        readings: measurements at the end of the step, with leading axis T.
-        command: float32 [T, 3], commanded vx, vy in m/s and yaw rate in rad/s.
-        contact: float32 [T, F], 1 where a foot is on the floor at the end of the step.
-        terms: float32 [T, 23], unweighted reward terms T1 to T23.
-        reward: float32 [T].
-        coefficient: curriculum coefficient c.
-        ended: "horizon", "fell" or "not finite".
-        descriptions: descriptions of the design.
-    """
+    """T control steps of one robot; NumPy arrays, row t belongs to control step t."""
 
     qpos: np.ndarray
+    """float64 [T, nq], positions at the beginning of the step."""
     observation: Observation
+    """What the networks saw, with leading axis T."""
     action: np.ndarray
+    """float32 [T, J], mean actions of the policy."""
     readings: Readings
+    """Measurements at the end of the step, with leading axis T."""
     command: np.ndarray
+    """float32 [T, 3], commanded vx, vy in m/s and yaw rate in rad/s."""
     contact: np.ndarray
+    """float32 [T, F], 1 where a foot is on the floor at the end of the step."""
     terms: np.ndarray
+    """float32 [T, 23], unweighted reward terms T1 to T23."""
     reward: np.ndarray
+    """float32 [T]."""
     coefficient: float
+    """Curriculum coefficient c."""
     ended: str
+    """"horizon", "fell" or "not finite"."""
     descriptions: Descriptions
+    """Descriptions of the design."""
 
     @property
     def time(self) -> np.ndarray:
@@ -99,8 +96,10 @@ def record_episode(
         task: settings of the task, those of the evaluation if not given.
 
     Raises:
-        ValueError: for a design, command, length or coefficient that is not as described.
+        ValueError: for a design, command, length or coefficient that is not as described, or if
+            the simulation becomes invalid in its first step.
     """
+    # What is asked for.
     require_agent(agent)
     space = DesignSpace(robot)
     design = space.validate(space.reference if design is None else design)
@@ -114,6 +113,8 @@ def record_episode(
     if command is not None:
         command = require_array("command (vx, vy, yaw rate)", command, (3,))
         task = dataclasses.replace(task, command_change=0.0)
+
+    # The episode's start.
     env = _environment(robot, task)
     key = jax.random.PRNGKey(seed)
     state = env.reset(key, design, coefficient=coefficient, keys=key[None])
@@ -122,6 +123,8 @@ def record_episode(
     policy = _mean_action(agent.policy_config)
     physics = env.groups[0].physics
     descriptions = jax.tree.map(lambda x: np.asarray(x)[0], state.descriptions)
+
+    # Its control steps, until it ends. What the engine overwrites is copied.
     rows, ended = [], "horizon"
     for _ in range(min(round(seconds / CONTROL_STEP), task.horizon)):
         qpos, before = physics.qpos[0].copy(), np.asarray(state.command)[0]

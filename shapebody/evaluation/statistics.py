@@ -1,21 +1,24 @@
-"""Bootstrap intervals over starts and episodes, paired gains, rank correlation."""
+"""Bootstrap intervals over starts and episodes, paired gains, rank correlation.
+
+The bootstrap of a mean is our own: it is the one-axis case of the bootstrap over starts and
+episodes at once, which libraries do not have.
+"""
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, NamedTuple
+import warnings
+from typing import NamedTuple
 
 import numpy as np
 
 from shapebody.arguments import refuse, require_array, require_integer, require_number, require_seed
 
-if TYPE_CHECKING:
-    from shapebody.evaluation.evaluate import Evaluation
-
 CONFIDENCE = 0.95
-
+"""Coverage of all intervals, unless another one is asked for."""
 RESAMPLES = 10_000
-
+"""Bootstrap samples of a mean."""
 MOST_EPISODES, MOST_RESAMPLES = 1_000_000, 1_000_000
+"""Largest numbers of episodes and of bootstrap samples."""
 
 
 def bootstrap_interval(
@@ -47,7 +50,7 @@ def bootstrap_interval(
     _require_resampling(confidence, resamples, seed)
     weights = _resampled(np.random.default_rng(seed), values.shape[-1], resamples)
     low, high = _percentiles(values @ weights.T, confidence)
-    return _out(low), _out(high)
+    return float_or_array(low), float_or_array(high)
 
 
 def _require_resampling(confidence, resamples, seed) -> None:
@@ -78,8 +81,8 @@ class Gain(NamedTuple):
 
 
 def paired_gain(
-    after: Evaluation | np.ndarray,
-    before: Evaluation | np.ndarray,
+    after,
+    before,
     *,
     confidence: float = CONFIDENCE,
     resamples: int = RESAMPLES,
@@ -88,15 +91,20 @@ def paired_gain(
     """Gain in return ΔR of designs `after` over designs `before`, paired by start.
 
     With [S, E] returns the interval is a bootstrap over the S starts and the E episodes at once:
-    all designs live through the same episodes, so what these episodes happen to favour is common
-    to all starts and does not average out over them. With [E] returns of one design it is a
+    all designs have the same episodes, so the luck of these episodes is common to all starts and
+    does not average out over them. With [E] returns of one design it is a
     bootstrap over the paired episodes. Evaluate both with the same seed.
 
+    Args:
+        after, before: what `evaluate` returned, or arrays of returns [S, E] or [E].
+        confidence, resamples, seed: see `bootstrap_interval`.
+
     Raises:
-        ValueError: if the shapes differ, or the two evaluations had other seeds or settings.
+        ValueError: if the shapes differ, or the two evaluations differ in seed or settings.
     """
+    # Two evaluations have to be of the same episodes.
     if hasattr(after, "returns") and hasattr(before, "returns"):
-        for name in ("robot", "engine", "seed", "coefficient", "task", "recompute_constants"):
+        for name in ("robot", "engine", "seed", "coefficient", "task"):
             if after.settings[name] != before.settings[name]:
                 raise ValueError(
                     f"the evaluations differ in {name}: {after.settings[name]!r} and "
@@ -136,7 +144,8 @@ def _differences(values, baseline, names=("values", "baseline")):
     return values - baseline
 
 
-def _out(value):
+def float_or_array(value):
+    """A float in place of an array without axes."""
     return float(value) if np.ndim(value) == 0 else value
 
 
@@ -154,24 +163,36 @@ def verdict(low: float, high: float) -> str:
 def rank_correlation(x, y, resamples: int = 2000, seed: int = 0) -> tuple[float, float, float]:
     """Spearman's ρ of x and y [n] and its 95 % bootstrap interval over pairs: (ρ, low, high).
 
-    NaN where ρ does not exist because x or y is constant. Raises ValueError below three pairs.
+    ρ is NaN if x or y is constant; resamples in which one is constant are left out of the interval.
+
+    Raises:
+        ValueError: if there are fewer than three pairs, or x and y have different lengths.
     """
-    from scipy.stats import rankdata
+    from scipy import stats
 
     x, y = require_array("x", x).astype(float), require_array("y", y).astype(float)
-    require_integer("resamples", resamples, 1, 1_000_000)
+    require_integer("resamples", resamples, 2, MOST_RESAMPLES)
     require_seed("seed", seed)
     if x.shape != y.shape or x.ndim != 1 or len(x) < 3:
         raise ValueError(f"x {x.shape} and y {y.shape}: expected two lists of three or more pairs")
 
-    def correlation(x, y):
-        a, b = (rankdata(v, axis=-1) for v in (x, y))
-        a, b = (v - v.mean(-1, keepdims=True) for v in (a, b))
-        scale = np.sqrt((a * a).sum(-1) * (b * b).sum(-1))
-        return np.where(scale > 0, (a * b).sum(-1) / np.where(scale > 0, scale, 1.0), np.nan)
+    def correlation(x, y, axis):
+        ranks = (stats.rankdata(values, axis=axis) for values in (x, y))
+        return stats.pearsonr(*ranks, axis=axis).statistic
 
-    chosen = np.random.default_rng(seed).integers(0, len(x), (resamples, len(x)))
-    samples = correlation(x[chosen], y[chosen])
+    with warnings.catch_warnings():
+        # Of a resample in which x or y is constant.
+        warnings.simplefilter("ignore", stats.DegenerateDataWarning)
+        rho = stats.spearmanr(x, y).statistic
+        samples = stats.bootstrap(
+            (x, y),
+            correlation,
+            n_resamples=resamples,
+            paired=True,
+            vectorized=True,
+            method="percentile",
+            rng=np.random.default_rng(seed),
+        ).bootstrap_distribution
     samples = samples[np.isfinite(samples)]
-    low, high = np.quantile(samples, [0.025, 0.975]) if len(samples) else (np.nan, np.nan)
-    return float(correlation(x, y)), float(low), float(high)
+    low, high = _percentiles(samples, CONFIDENCE) if len(samples) else (np.nan, np.nan)
+    return float(rho), float(low), float(high)

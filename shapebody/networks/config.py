@@ -2,17 +2,11 @@
 
 from typing import Literal
 
-from shapebody.configuration import (
-    NonNegative,
-    Pair,
-    Positive,
-    configuration,
-    integer,
-    sequence,
-)
+from shapebody.configuration import NonNegative, Pair, Positive, configuration, integer, sequence
 
 WIDEST, MOST_LAYERS = 65_536, 100
 """Largest width of a layer, and largest number of layers."""
+
 Width = integer(1, WIDEST)
 Widths = sequence(
     Width, f"widths of layers, at least one, each from 1 to {WIDEST:,}", 1, MOST_LAYERS
@@ -23,41 +17,36 @@ Widths = sequence(
 class PolicyConfig:
     """Sizes of the URMA policy. The defaults are the paper's: 945,430 parameters.
 
-    Attributes:
-        key_widths: widths of the layers that make a joint's key; the last one is the latent
-            dimension L over which the softmax runs.
-        value_latent: width of a joint's value.
-        core_widths: widths of the core network. The last one must equal the last key width,
-            because an action mean is the dot product of the two.
-        initial_temperature: start of the learned softmax temperature. Keys are bounded by tanh, so
-            at 1.0 no entry of a softmaxed key can exceed 7.4 times another: all joints start with
-            nearly the same key and the sum can hardly tell them apart. 0.2 is a better start for
-            short training; the authors' published Go2 policy ended at 0.1.
-        minimum_temperature: lower bound of the temperature.
-        latent_scale: factor on the summed latent, which enters the core beside the general
-            observations; the paper has none (1.0). Action means are not scaled. A softmaxed key
-            has entries of about 1/L, so 8.0 makes both inputs of the core equally large, but it
-            also enlarges the joints' exploration noise, which then hides command and gait clock
-            from the core. Agents trained before 1.0 became the default keep their 8.0.
-        initial_std: standard deviation of all actions before training.
-        log_std_input: "tanh" (the key before the softmax) or "softmax" (the key after it).
-        mean_limit: action means are clipped to +-mean_limit.
-        std_limits: lowest and highest standard deviation.
-
     Raises:
         ValueError: if the widths do not fit together or a value is out of range.
     """
 
     key_widths: Widths = (256, 256)
+    """Widths of the layers that make a joint's key. The last one is the latent dimension L over
+    which the softmax runs."""
     value_latent: Width = 4
+    """Width of a joint's value."""
     core_widths: Widths = (512, 256, 256, 256, 256)
+    """Widths of the core network. The last one must equal the last key width, because an action
+    mean is the dot product of the two."""
     initial_temperature: Positive = 1.0
+    """Start of the learned softmax temperature. Keys are bounded by tanh, so at 1.0 no entry of a
+    softmaxed key can exceed 7.4 times another: all joints start with nearly the same key, and the
+    sum can hardly tell them apart. 0.2 is a better start for short training; the authors' published
+    Go2 policy ended at 0.1."""
     minimum_temperature: NonNegative = 0.025
+    """Lower bound of the temperature."""
     latent_scale: Positive = 1.0
+    """Factor on the summed latent before it enters the core; the paper has none (1.0). Some
+    shipped agents were trained with 8.0."""
     initial_std: Positive = 1.0
+    """Standard deviation of all actions before training."""
     log_std_input: Literal["tanh", "softmax"] = "tanh"
+    """What gives the standard deviation: the key before the softmax, or after it."""
     mean_limit: Positive = 10.0
+    """Action means are clipped to ±mean_limit."""
     std_limits: Pair = (0.01, 2.0)
+    """Lowest and highest standard deviation."""
 
     def __post_init__(self):
         _check_temperatures(self)
@@ -88,31 +77,30 @@ class CriticConfig:
     """Sizes of a URMA critic. The defaults are the paper's direct-design critic: 5,378,312
     parameters.
 
-    Attributes:
-        kind: "direct-design" (values see descriptions and observations) or "original" (values see
-            observations only).
-        heads: number K of value heads on the shared encoders.
-        joint_key_widths, foot_key_widths: widths of the key layers; the last is the latent
-            dimension of the softmax.
-        joint_value_latent, foot_value_latent: width of a part's value.
-        head_widths: hidden widths of every head; the output layer of width 1 follows.
-        initial_temperature, minimum_temperature, latent_scale: see `PolicyConfig`. A direct-design
-            critic's latent is large at 1.0 already, because its values are made of descriptions.
-
     Raises:
         ValueError: if a value is out of range.
     """
 
     kind: Literal["direct-design", "original"] = "direct-design"
+    """Whether values are made of descriptions and observations, or of observations only."""
     heads: Width = 3
+    """Number K of value heads on the shared encoders."""
     joint_key_widths: Widths = (64, 64)
+    """Widths of the layers that make a joint's key; the softmax runs over the last one."""
     joint_value_latent: Width = 32
+    """Width of a joint's value."""
     foot_key_widths: Widths = (32, 32)
+    """The same for feet."""
     foot_value_latent: Width = 32
+    """The same for feet."""
     head_widths: Widths = (512, 256, 128, 128, 128)
+    """Hidden widths of every head; the output layer of width 1 follows."""
     initial_temperature: Positive = 1.0
+    """Start of the learned softmax temperature, see `PolicyConfig`."""
     minimum_temperature: NonNegative = 0.025
+    """Lower bound of the temperature."""
     latent_scale: Positive = 1.0
+    """Factor on the summed latents, see `PolicyConfig`."""
 
     def __post_init__(self):
         _check_temperatures(self)

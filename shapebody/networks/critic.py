@@ -1,4 +1,8 @@
-"""The critics: original and direct-design (eq. 3)."""
+"""The critics: original and direct-design (eq. 3).
+
+Joints and feet are encoded like the joints of the policy. Every head is a core network of its own
+over both latents, all observations of the whole robot and what is static of the design.
+"""
 
 from typing import Any
 
@@ -13,14 +17,14 @@ from shapebody.networks.inputs import (
     INPUT_SIZES,
     JOINT_DESCRIPTION,
     JOINT_OBSERVATION,
-    _join,
-    _Standardized,
+    Standardized,
+    join,
     require_inputs,
 )
 from shapebody.networks.urma import Core, PartEncoder
 
 
-class Critic(_Standardized):
+class Critic(Standardized):
     """A URMA critic: K state values from joints, feet and general observations.
 
     `apply(variables, descriptions, observation)` gives values [..., K], differentiable with
@@ -88,7 +92,7 @@ class Critic(_Standardized):
         )
         general = self.standardize("general", observation.general)
         privileged = self.standardize("privileged", observation.privileged)
-        values = self.heads(_join(joints, feet, general, embedding["static"], privileged))
+        values = self.heads(join(joints, feet, general, embedding["static"], privileged))
         return jnp.moveaxis(values[..., 0], 0, -1)
 
     def act(self, embedding, descriptions, observation):

@@ -1,4 +1,11 @@
-"""What enters the networks: sizes of the parts, checks, standardization, first variables."""
+"""What enters the networks: sizes of the inputs, checks, standardization, first variables.
+
+Inputs are read by attribute: descriptions need joints [..., J, 30], joint_mask [..., J],
+feet [..., F, 21], foot_mask [..., F] and static [..., 14]; observations need joints [..., J, 4],
+feet [..., F, 3], general [..., 13] and privileged [..., 5]. The leading axes of the two are
+broadcast against each other: descriptions [B, 1, ...] with observations [B, T, ...] are encoded
+B times only. Joints and feet whose mask is 0 are padding, which has no influence on anything.
+"""
 
 from collections.abc import Mapping
 from types import SimpleNamespace
@@ -10,18 +17,13 @@ from flax import linen as nn
 
 from shapebody.arguments import refuse, require_key, require_kind, require_number, require_shape
 
+# Numbers of columns. What they are is said by `design.descriptions` and `task.observations`.
 JOINT_DESCRIPTION = 30
-
 FOOT_DESCRIPTION = 21
-
 STATIC = 14
-
 JOINT_OBSERVATION = 4
-
 FOOT_OBSERVATION = 3
-
 GENERAL = 13
-
 PRIVILEGED = 5
 
 INPUT_SIZES = {
@@ -45,9 +47,9 @@ OBSERVATION_PARTS = {
 
 
 def require_inputs(descriptions, observation, of_policy: bool = False) -> None:
-    """TypeError if a network's inputs lack what is read of them; ValueError for wrong columns.
+    """TypeError if a part of a network's inputs is missing; ValueError for wrong columns.
 
-    of_policy: feet and privileged observations may be absent. Costs nothing in compiled code.
+    of_policy: feet and privileged observations may be missing. Costs nothing in compiled code.
     """
     unread = ("feet", "privileged") if of_policy else ()
     for argument, value, parts, hint in (
@@ -72,10 +74,17 @@ def _require_parts(argument, value, parts, hint) -> None:
         require_shape(f"{argument}.{name}", getattr(value, name), (*leading, columns))
 
 
-class _Standardized(nn.Module):
-    """Declares the input constants (collection "constants", identity unless given)."""
+class Standardized(nn.Module):
+    """A network that standardizes its inputs by constants, the collection "constants"."""
+
+    def declare(self, *names):
+        """Declare the constants of these inputs; they are the identity unless given."""
+        self.constants = {
+            name: self.variable("constants", name, identity, INPUT_SIZES[name]) for name in names
+        }
 
     def standardize(self, name, value):
+        """An input [..., n] as (input - mean) / scale."""
         size = INPUT_SIZES[name]
         if value.shape[-1] != size:
             raise ValueError(
@@ -84,18 +93,14 @@ class _Standardized(nn.Module):
         constants = self.constants[name].value
         return (value - constants["mean"]) / constants["scale"]
 
-    def declare(self, *names):
-        self.constants = {
-            name: self.variable("constants", name, _identity, INPUT_SIZES[name]) for name in names
-        }
 
-
-def _identity(size):
+def identity(size: int) -> dict:
+    """Constants that leave an input of `size` columns as it is."""
     return {"mean": jnp.zeros(size), "scale": jnp.ones(size)}
 
 
-def _join(*parts):
-    """Concatenate along the last axis after broadcasting the leading ones."""
+def join(*parts):
+    """Concatenate arrays along the last axis after broadcasting the leading ones."""
     leading = np.broadcast_shapes(*(part.shape[:-1] for part in parts))
     return jnp.concatenate(
         [jnp.broadcast_to(part, leading + part.shape[-1:]) for part in parts], axis=-1
@@ -137,7 +142,7 @@ def initialize(network, key, constants=None) -> dict:
 
 def _require_constants(constants) -> None:
     """TypeError or ValueError if input constants are not as `standardization` returns them."""
-    require_kind("constants", constants, Mapping, "what networks.standardization returns")
+    require_kind("constants", constants, Mapping, "inputs.standardization(descriptions)")
     for name, size in INPUT_SIZES.items():
         one = constants.get(name)
         if not isinstance(one, Mapping) or one.keys() != {"mean", "scale"}:
@@ -159,14 +164,14 @@ OBSERVATION_CONSTANTS = {
 def standardization(*descriptions, floor=1e-3, constant=1e-6) -> dict:
     """Input constants: descriptions to zero mean and unit deviation, observations to fixed scales.
 
-    The paper's divisors fit 50 robots; over the designs of one robot they leave some columns with
-    differences of 0.002, which a small network learns slowly.
+    Not in the paper, whose divisors fit 50 robots. Over the designs of one robot they leave some
+    columns with differences of 0.002, which a small network learns slowly.
 
     Args:
         descriptions: one or more `Descriptions`, each with any leading batch axes, drawn from the
-            designs to be trained on. Padded joints and feet are left out.
-        floor: lowest divisor, so that a column that hardly differs is not blown up.
-        constant: a column whose deviation is below this is centred only (divisor 1).
+            designs of the training. Padded joints and feet are left out.
+        floor: lowest divisor > 0, so that a column that hardly differs does not become large.
+        constant: a column whose deviation is below this (>= 0) is only centred (divisor 1).
 
     Returns:
         {name: {"mean": f32[n], "scale": f32[n]}} for all network inputs; an input enters a network
@@ -177,7 +182,7 @@ def standardization(*descriptions, floor=1e-3, constant=1e-6) -> dict:
         ValueError: if no descriptions are given.
     """
     if not descriptions:
-        raise ValueError("standardization got no descriptions; give at least one batch of them")
+        raise ValueError("descriptions are missing; expected at least one batch of them")
     require_number("floor", floor, above=0)
     require_number("constant", constant, 0)
     for batch in descriptions:

@@ -1,4 +1,8 @@
-"""The URMA policy and the density of its actions."""
+"""The URMA policy and the density of its actions.
+
+The mean of joint j's action is the dot product of its key with the output of the core network,
+which sees the latent of all joints, the general observations and what is static of the design.
+"""
 
 from typing import Any
 
@@ -11,14 +15,14 @@ from shapebody.networks.config import PolicyConfig
 from shapebody.networks.inputs import (
     JOINT_DESCRIPTION,
     JOINT_OBSERVATION,
-    _join,
-    _Standardized,
+    Standardized,
+    join,
     require_inputs,
 )
 from shapebody.networks.urma import Core, PartEncoder
 
 
-class Policy(_Standardized):
+class Policy(Standardized):
     """The URMA policy: one Gaussian per joint, any number of joints.
 
     `apply(variables, descriptions, observation)` gives (mean, std), both [..., J]; actions are in
@@ -65,15 +69,17 @@ class Policy(_Standardized):
         Padded joints get mean 0 and standard deviation 1.
         """
         mask = descriptions.joint_mask
+        # Means.
         latent, keys, tanh_keys = self.joint_encoder(
             embedding["joints"],
             self.standardize("joint_observations", observation.joints),
             mask,
         )
         general = self.standardize("general", observation.general)
-        core = self.core(_join(latent, general, embedding["static"]))
+        core = self.core(join(latent, general, embedding["static"]))
         mean = jnp.einsum("...k,...jk->...j", core, keys)
         mean = jnp.clip(mean, -self.config.mean_limit, self.config.mean_limit)
+        # Standard deviations.
         log_std = self.log_std(tanh_keys if self.config.log_std_input == "tanh" else keys)
         # The logarithm is clipped, not its exponential: an overflow would make the gradient NaN.
         low, high = np.log(self.config.std_limits)

@@ -11,7 +11,14 @@ import numpy as np
 
 from shapebody.arguments import require_name, require_path
 from shapebody.networks.config import PolicyConfig
-from shapebody.networks.inputs import GENERAL, JOINT_DESCRIPTION, JOINT_OBSERVATION, STATIC
+from shapebody.networks.inputs import (
+    GENERAL,
+    INPUT_SIZES,
+    JOINT_DESCRIPTION,
+    JOINT_OBSERVATION,
+    STATIC,
+    identity,
+)
 from shapebody.networks.policy import Policy
 
 # Dense_0, Dense_1: key; Dense_2: value; Dense_3 to Dense_7: core; Dense_8: log-std.
@@ -28,8 +35,8 @@ def load_published_policy(folder, name=None):
 
     Args:
         folder: directory with the two files.
-        name: robot name, the part of the file names before `.weights`. It may be left out if the
-            folder holds one policy only.
+        name: robot name, the part of the file names before `.weights`; not needed if the folder
+            holds one policy only.
 
     Returns:
         (policy, variables): `policy.apply(variables, descriptions, observation)` gives (mean, std).
@@ -68,8 +75,8 @@ def _read_layers(layers, numbers_file):
         start, size = layer["offset"], layer["size_bytes"]
         if size != 4 * int(np.prod(shape)) or start < 0 or start + size > len(numbers):
             raise ValueError(
-                f"{name} of shape {shape} is said to be {size} bytes from byte {start}, but "
-                f"{numbers_file} has {len(numbers)} bytes; fetch both files again"
+                f"{name} of shape {shape} should be {size} bytes from byte {start} of "
+                f"{numbers_file}, which has {len(numbers)} bytes; fetch both files again"
             )
         array = np.frombuffer(numbers, "<f4", size // 4, start).reshape(shape)
         if not np.isfinite(array).all():
@@ -140,13 +147,5 @@ def _params(weights):
 
 
 def _identity_constants():
-    sizes = {
-        "joint_descriptions": JOINT_DESCRIPTION,
-        "static": STATIC,
-        "joint_observations": JOINT_OBSERVATION,
-        "general": GENERAL,
-    }
-    return {
-        name: {"mean": np.zeros(size, np.float32), "scale": np.ones(size, np.float32)}
-        for name, size in sizes.items()
-    }
+    names = ("joint_descriptions", "static", "joint_observations", "general")
+    return {name: identity(INPUT_SIZES[name]) for name in names}

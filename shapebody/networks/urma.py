@@ -1,4 +1,4 @@
-"""URMA networks: the policy, the original critic and the direct-design critic (eq. 3).
+"""What policy and critics are built of: the encoder of joints and feet (eq. 3), and the core.
 
 A robot is a set of joints and a set of feet, each with a description d and an observation o. Every
 part is encoded on its own and the parts are summed, so one network serves any number of them:
@@ -13,12 +13,6 @@ output passes a tanh, and key and value meet in an outer product; eq. (3) writes
 only, no tanh and an elementwise product. The first key layer is linear in [d, o], so `embed`
 computes the part that depends on the design once, and `act` (or `value`) adds the rest for every
 state of that design.
-
-Inputs are read by attribute: descriptions need joints [..., J, 30], joint_mask [..., J],
-feet [..., F, 21], foot_mask [..., F] and static [..., 14]; observations need joints [..., J, 4],
-feet [..., F, 3], general [..., 13] and privileged [..., 5]. The leading axes of the two are
-broadcast against each other: descriptions [B, 1, ...] with observations [B, T, ...] are encoded
-B times only. Joints and feet whose mask is 0 have no influence on anything.
 """
 
 import jax
@@ -67,11 +61,19 @@ class PartEncoder(nn.Module):
         return embedding
 
     def temperature(self):
+        """The learned temperature [1] of the softmax over a key."""
         return jnp.exp(self.log_temperature) + self.minimum_temperature
 
     def __call__(self, embedding, observations, mask):
-        """Latent [..., L * value_latent], softmaxed keys and tanh keys [..., parts, L]."""
+        """Latent [..., L * value_latent], softmaxed keys and tanh keys [..., parts, L].
+
+        Args:
+            embedding: what `embed` made of the descriptions.
+            observations: [..., parts, n].
+            mask: [..., parts], 0 for padding.
+        """
         size = self.description_size
+        # Keys.
         hidden = embedding["key"] + observations @ self.key_kernel[size:]
         hidden = self.key_norm(hidden)
         for layer in self.key_layers:
@@ -79,6 +81,7 @@ class PartEncoder(nn.Module):
         # The published clip of tanh to +-(1 - 1e-8) is the identity in float32.
         tanh_keys = jnp.tanh(hidden)
         keys = nn.softmax(tanh_keys / self.temperature(), axis=-1)
+        # Values, of the observation alone unless the critic is a direct-design one.
         if self.direct_design:
             values = embedding["value"] + observations @ self.value_kernel[size:]
         else:

@@ -1,4 +1,13 @@
-"""Augmented random search (Appendix C: ARS): ascent along differences in random directions."""
+"""Augmented random search (Appendix C: ARS), V1-t of Mania et al. (2018).
+
+    repeat N times
+        draw D directions δ_k ~ N(0, I)
+        score f + ν δ_k and f - ν δ_k, clipped to [-1, 1]^d, on one new minibatch of states
+        take the b directions whose better side is best
+        f <- clip(f + α / (b σ_R) Σ_k [Ĵ(f + ν δ_k) - Ĵ(f - ν δ_k)] δ_k)
+
+σ_R is the standard deviation of the 2 b values.
+"""
 
 from __future__ import annotations
 
@@ -8,11 +17,7 @@ import jax
 import jax.numpy as jnp
 
 from shapebody.configuration import Count, Positive, Share, configuration
-from shapebody.optimizers.loop import (
-    Search,
-    Steps,
-    iterate,
-)
+from shapebody.optimizers.loop import Search, Steps, iterate
 
 
 @configuration
@@ -23,7 +28,9 @@ class ARSConfig:
     directions: Count = 16
     """Random directions per iteration, each tried both ways."""
     perturbation_std: Positive = 0.1
+    """ν, length of a step by which directions are tried."""
     learning_rate: Positive = 0.05
+    """α."""
     top_fraction: Share = 1.0
     """Part of the directions, by the better of their two values, that is used."""
 
@@ -39,30 +46,26 @@ class _Point(NamedTuple):
 
 
 def ars(objective, starts, key, config: ARSConfig) -> Search:
-    """Augmented random search (Mania et al., V1-t); returns the last design.
-
-    f <- clip(f + α / (b σ_R) Σ_k [Ĵ(f + ν δ_k) - Ĵ(f - ν δ_k)] δ_k) over the b best of D Gaussian
-    directions δ_k, with the standard deviation σ_R of the 2 b values. All are of one minibatch.
-    """
+    """Ascent along differences of the objective in random directions; returns the last design."""
     evaluations = 2 * config.iterations * config.directions
-    return iterate(objective, starts, key, config, _ARS, evaluations)
+    return iterate(objective, starts, key, config, _STEPS, evaluations)
 
 
 def _directions(config, key, size):
     return jax.random.normal(key, (config.directions, size))
 
 
-def _ars_begin(config, start, key):
+def _begin(config, start, key):
     return _Point(start, _directions(config, key, len(start)))
 
 
-def _ars_propose(config, memory, key):
+def _propose(config, memory, key):
     steps = config.perturbation_std * memory.directions
     both = jnp.concatenate([memory.design + steps, memory.design - steps])
     return jnp.clip(both, -1.0, 1.0)
 
 
-def _ars_update(config, memory, scored, key):
+def _update(config, memory, scored, key):
     pairs = scored.values.reshape(2, -1)
     # A direction of which one side is broken says nothing about the slope.
     valid = jnp.all(jnp.isfinite(pairs), axis=0)
@@ -77,4 +80,4 @@ def _ars_update(config, memory, scored, key):
     return _Point(design, _directions(config, key, len(design)))
 
 
-_ARS = Steps(_ars_begin, _ars_propose, _ars_update)
+_STEPS = Steps(_begin, _propose, _update)

@@ -1,4 +1,13 @@
-"""Bayesian optimization (Appendix C: BO), by the library BoTorch, an optional dependency."""
+"""Bayesian optimization (Appendix C: BO), by the library BoTorch, an optional dependency.
+
+    score the start and Sobol points on the first minibatch of states
+    repeat N times
+        fit a Gaussian process to all scored designs
+        choose the design with the highest expected improvement, and score it on a new minibatch
+
+The Gaussian process is BoTorch's SingleTaskGP with a Matérn 5/2 kernel, one length scale per
+parameter and BoTorch's priors; the acquisition function is qLogNoisyExpectedImprovement with q = 1.
+"""
 
 from __future__ import annotations
 
@@ -27,17 +36,15 @@ class BOConfig:
     raw_samples: Count = 256
     """Points among which these are chosen."""
     steps: Count = 50
-    """Most steps of that optimization. The paper does not say; BoTorch's 200 take three times as
+    """Most steps of that optimization; not given in the paper. BoTorch's 200 take three times as
     long."""
 
 
 def bo(objective, starts, key, config: BOConfig) -> Search:
     """Bayesian optimization, with a Gaussian process of its own for every start [S, d].
 
-    BoTorch's SingleTaskGP with a Matérn 5/2 kernel, one length scale per parameter and BoTorch's
-    priors, and qLogNoisyExpectedImprovement with q = 1. Returns the scored design with the highest
-    posterior mean, since every value is of another minibatch. Designs whose value is not finite
-    are not shown to the Gaussian process.
+    Returns the scored design with the highest posterior mean, since every value is of another
+    minibatch. Designs whose value is not finite are not shown to the Gaussian process.
 
     The Gaussian processes of different starts are fitted side by side, in up to `PROCESSES` Python
     processes, of some hundred megabytes each; the objective is computed in this one.
@@ -96,6 +103,7 @@ class _Surrogate:
         self.hyperparameters = None
 
     def seed(self) -> int:
+        """A new seed for one of the library's random numbers."""
         return int(self.seeds.integers(2**31))
 
     def initial(self) -> np.ndarray:
@@ -158,7 +166,7 @@ class _Surrogate:
 
 
 def _turn(surrogate: _Surrogate, designs, values, last: bool):
-    """Learn from scored designs [P, d]: (surrogate, best design [d], next designs [1, d]).
+    """Learn from scored designs [P, d]; returns (surrogate, best design [d], next designs [1, d]).
 
     The best is the scored design with the highest posterior mean, or the start if none has a
     finite value. After the `last` turn nothing new is proposed.

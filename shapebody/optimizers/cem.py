@@ -1,4 +1,14 @@
-"""The cross-entropy method (Appendix C)."""
+"""The cross-entropy method (Appendix C: CEM).
+
+    m <- start, s <- initial_std
+    repeat N times
+        draw P designs from N(m, diag(s²)), clipped to [-1, 1]^d
+        score them on a new minibatch of states
+        m, s <- mean and standard deviation of the elites (the best 20 %), s at least minimum_std
+
+What is found is the last mean: in hundreds of dimensions it is far better than every sample drawn
+around it.
+"""
 
 from __future__ import annotations
 
@@ -8,11 +18,7 @@ import jax
 import jax.numpy as jnp
 
 from shapebody.configuration import Count, Positive, Share, configuration
-from shapebody.optimizers.loop import (
-    Search,
-    Steps,
-    iterate,
-)
+from shapebody.optimizers.loop import Search, Steps, iterate
 
 
 @configuration
@@ -40,24 +46,21 @@ class _Gaussian(NamedTuple):
 
 
 def cem(objective, starts, key, config: CEMConfig) -> Search:
-    """Cross-entropy method with a diagonal Gaussian around the start; returns its final mean.
-
-    In hundreds of dimensions the mean is far better than every sample drawn around it.
-    """
+    """Cross-entropy method with a diagonal Gaussian around the start; returns its last mean."""
     evaluations = config.iterations * config.particles
-    return iterate(objective, starts, key, config, _CEM, evaluations)
+    return iterate(objective, starts, key, config, _STEPS, evaluations)
 
 
-def _cem_begin(config, start, key):
+def _begin(config, start, key):
     return _Gaussian(start, jnp.full_like(start, config.initial_std))
 
 
-def _cem_propose(config, memory, key):
+def _propose(config, memory, key):
     noise = jax.random.normal(key, (config.particles, len(memory.design)))
     return jnp.clip(memory.design + memory.std * noise, -1.0, 1.0)
 
 
-def _cem_update(config, memory, scored, key):
+def _update(config, memory, scored, key):
     values, rows = jax.lax.top_k(scored.values, config.elites)
     elites, valid = scored.designs[rows], jnp.isfinite(values)[:, None]
     mean = jnp.mean(elites, axis=0, where=valid)
@@ -69,4 +72,4 @@ def _cem_update(config, memory, scored, key):
     )
 
 
-_CEM = Steps(_cem_begin, _cem_propose, _cem_update)
+_STEPS = Steps(_begin, _propose, _update)

@@ -1,4 +1,14 @@
-"""Covariance matrix adaptation evolution strategy (Appendix C: CMA-ES), by the library `cma`."""
+"""Covariance matrix adaptation evolution strategy (Appendix C: CMA-ES), by the library `cma`.
+
+    m <- start, σ <- initial_std, C <- I, diagonal
+    repeat N times
+        draw P designs from N(m, σ² C), and score them on a new minibatch of states
+        m <- weighted mean of the better half; σ and C follow the paths that m has taken
+
+The library keeps the box by a smooth transformation. What is found is the last mean, which averages
+over samples and minibatches: in hundreds of dimensions it is far better than every sample drawn
+around it.
+"""
 
 from __future__ import annotations
 
@@ -10,12 +20,7 @@ import numpy as np
 
 from shapebody.arguments import require_integer
 from shapebody.configuration import Count, Positive, configuration, integer
-from shapebody.optimizers.loop import (
-    Search,
-    last_finite,
-    score,
-    start_key,
-)
+from shapebody.optimizers.loop import Search, last_finite, score, start_key
 
 
 @configuration
@@ -36,18 +41,14 @@ class CMAESConfig:
 
 
 def cma_es(objective, starts, key, config: CMAESConfig) -> Search:
-    """CMA-ES with a diagonal covariance, from Gaussians around the starts [S, d].
-
-    Bounds are kept by the library's smooth transformation of the box. Returns the mean of the last
-    generation's Gaussian, which averages over samples and minibatches, and not the best sample: in
-    hundreds of dimensions the mean is far better than every sample drawn around it.
-    """
+    """CMA-ES with a diagonal covariance, one strategy for each of the starts [S, d]."""
     starts = np.asarray(starts, np.float32)
     particles = config.population(starts.shape[1])
     strategies = [_strategy(start, key, config, particles) for start in starts]
     keys = jax.random.split(key, config.iterations + 1)
     trajectory, history = [starts], []
     for batch_key in keys[:-1]:
+        # The mean is scored with the samples, for the history alone.
         asked = np.clip([strategy.ask() for strategy in strategies], -1, 1)
         rows = np.concatenate([trajectory[-1][:, None], asked], axis=1).astype(np.float32)
         values = np.asarray(score(objective, rows, batch_key), np.float64)

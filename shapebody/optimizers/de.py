@@ -1,4 +1,16 @@
-"""Differential evolution (Appendix C)."""
+"""Differential evolution (Appendix C: DE), in its form rand/1/bin.
+
+    x <- initial population, scored on the first minibatch of states
+    repeat N - 1 times
+        for every particle x_i
+            mutant <- a + F (b - c),   a, b, c three other particles, drawn at random
+            trial <- x_i with each parameter, at least one, from the mutant with probability CR
+        score the trials, clipped to [-1, 1]^d, on a new minibatch
+        x_i <- its trial, where that is better
+
+The paper does not say how the population begins: see `loop.initial_population`. A design that is
+kept keeps the value of the minibatch on which it was scored, as in the textbooks (see `pso`).
+"""
 
 from __future__ import annotations
 
@@ -8,12 +20,7 @@ import jax
 import jax.numpy as jnp
 
 from shapebody.configuration import Count, Positive, Probability, configuration, integer, number
-from shapebody.optimizers.loop import (
-    Search,
-    Steps,
-    initial_population,
-    iterate,
-)
+from shapebody.optimizers.loop import Search, Steps, initial_population, iterate
 
 
 @configuration
@@ -38,21 +45,20 @@ class _Population(NamedTuple):
 
 
 def de(objective, starts, key, config: DEConfig) -> Search:
-    """Differential evolution (rand/1/bin); returns the best design of the population.
+    """Differential evolution; returns the best design of the population.
 
-    For every particle, the mutant a + F (b - c) of three other particles is crossed with it, and
-    the clipped trial takes its place if it is better.
+    The first iteration scores the initial population.
     """
     evaluations = config.iterations * config.particles
-    return iterate(objective, starts, key, config, _DE, evaluations)
+    return iterate(objective, starts, key, config, _STEPS, evaluations)
 
 
-def _de_begin(config, start, key):
+def _begin(config, start, key):
     particles = initial_population(config, start, key)
     return _Population(start, particles, jnp.full(config.particles, -jnp.inf), jnp.int32(0))
 
 
-def _de_propose(config, memory, key):
+def _propose(config, memory, key):
     count, size = memory.particles.shape
 
     def trial(index, particle, key):
@@ -69,7 +75,7 @@ def _de_propose(config, memory, key):
     return jnp.where(memory.iteration == 0, memory.particles, trials)
 
 
-def _de_update(config, memory, scored, key):
+def _update(config, memory, scored, key):
     better = scored.values > memory.values
     particles = jnp.where(better[:, None], scored.designs, memory.particles)
     values = jnp.maximum(scored.values, memory.values)
@@ -78,4 +84,4 @@ def _de_update(config, memory, scored, key):
     return _Population(design, particles, values, memory.iteration + 1)
 
 
-_DE = Steps(_de_begin, _de_propose, _de_update)
+_STEPS = Steps(_begin, _propose, _update)

@@ -1,8 +1,18 @@
 """Gradient-covariance particle filter optimization (Appendix C: GC-PFO).
 
-The paper names the method (Vaish and Brock, 2026) and its settings and describes it in one
+    every region begins as the start, with isotropic noise of size `step_size` around it
+    repeat N times, in every region
+        score the particles and their gradients g on a new minibatch of states
+        w ∝ exp((Ĵ - max Ĵ) / (τ std Ĵ))                         weights
+        x <- particles resampled with weights w, moved by noise of covariance C = Σ w g gᵀ
+        the best particle stays as it is
+        τ and the noise fall linearly, to zero at the end
+
+The paper names the method (Vaish and Brock, 2026) and its settings, and describes it in one
 sentence: particles are resampled by their objective values and moved by exploration noise with the
-covariance of the gradients. What that leaves open is chosen here, as `gc_pfo` says.
+covariance of the gradients. The rest is chosen here. The noise is scaled so that a parameter moves
+by `step_size` in the root mean square. It goes along the directions in which the objective changes,
+and either way: the choice between them is left to the resampling.
 """
 
 from __future__ import annotations
@@ -22,7 +32,7 @@ class GCPFOConfig:
 
     iterations: Count = 50
     regions: Count = 2
-    """Populations that are resampled apart and have a gradient covariance each."""
+    """Populations, each with its own resampling and gradient covariance."""
     particles: integer(2) = 32
     """Particles per region."""
     step_size: Positive = 0.2
@@ -30,7 +40,7 @@ class GCPFOConfig:
     temperature: Positive = 1.0
     """τ_0, of the first resampling."""
     epsilon: Positive = 1e-8
-    """ε, keeps divisions by spreads and gradients of zero finite."""
+    """ε, keeps divisions finite where the spread or all gradients are zero."""
 
 
 class _Regions(NamedTuple):
@@ -40,18 +50,9 @@ class _Regions(NamedTuple):
 
 
 def gc_pfo(objective, starts, key, config: GCPFOConfig) -> Search:
-    """Particle filter whose exploration follows the gradients; returns the best last particle.
-
-    In every region, particles are resampled with weights w ∝ exp((Ĵ - max Ĵ) / (τ std Ĵ)) and
-    moved by Gaussian noise of covariance C = Σ w g gᵀ, scaled so that a parameter moves by
-    `step_size` in the root mean square: along the directions in which the objective changes, and
-    either way, since the choice between them is left to the resampling. Temperature and noise fall
-    linearly to zero over the iterations. A region begins as the start and isotropic noise of the
-    same size around it. The best particle of a region is always kept as it is. All values and
-    gradients of an iteration are of one minibatch.
-    """
+    """Particle filter whose exploration follows the gradients; returns the best last particle."""
     evaluations = config.iterations * config.regions * config.particles
-    return iterate(objective, starts, key, config, _GC_PFO, evaluations)
+    return iterate(objective, starts, key, config, _STEPS, evaluations)
 
 
 def _begin(config, start, key):
@@ -70,17 +71,23 @@ def _update(config, memory, scored, key):
     # The next population is scored in the next iteration; none follows the last.
     left = 1.0 - (memory.iteration + 1) / config.iterations
     keys = jax.random.split(key, config.regions)
-    move = jax.vmap(lambda *region: _move(config, left, *region))
-    particles = move(memory.particles, values, scored.gradients.reshape(shape), keys)
+    move_all = jax.vmap(lambda *region: move(config, left, *region))
+    particles = move_all(memory.particles, values, scored.gradients.reshape(shape), keys)
     best = jnp.argmax(scored.values)
     found = jnp.where(scored.values[best] > -jnp.inf, scored.designs[best], memory.design)
     return _Regions(found, particles, memory.iteration + 1)
 
 
-def _move(config, left, particles, values, gradients, key):
-    """Resample and perturb the particles [P, d] of one region."""
+def move(config, left, particles, values, gradients, key):
+    """Resample and perturb the particles [P, d] of one region.
+
+    `left`, from 1 to 0, is the share of the temperature and of the noise that remains. Particles
+    whose value [P] is not finite have no children, unless none is finite.
+    """
     count, size = particles.shape
     resample_key, noise_key = jax.random.split(key)
+
+    # Weights of the resampling, by value.
     valid = jnp.isfinite(values)
     spread = jnp.std(values, where=valid) + config.epsilon
     advantage = jnp.where(valid, values - jnp.max(values), -jnp.inf) / spread
@@ -91,12 +98,14 @@ def _move(config, left, particles, values, gradients, key):
     points = (jax.random.uniform(resample_key) + jnp.arange(count)) / count
     parents = jnp.searchsorted(jnp.cumsum(weights), points).clip(0, count - 1)
 
+    # Noise with the covariance of the weighted gradients, scaled to the size that is left.
     root = jnp.sqrt(weights)[:, None] * gradients  # rootᵀ root = C
     noise = jax.random.normal(noise_key, (count, count)) @ root
     noise *= left * config.step_size / (jnp.sqrt(jnp.sum(root**2) / size) + config.epsilon)
+
     best = jnp.argmax(values)
     parents, noise = parents.at[0].set(best), noise.at[0].set(0.0)
     return jnp.clip(particles[parents] + noise, -1.0, 1.0)
 
 
-_GC_PFO = Steps(_begin, _propose, _update, gradients=True)
+_STEPS = Steps(_begin, _propose, _update, gradients=True)

@@ -1,4 +1,13 @@
-"""What the search methods share: their result, checks of settings, and the loop over iterations."""
+"""What the search methods share: their result, and the loop of those that propose and learn.
+
+    memory <- begin(start)
+    repeat N times
+        designs <- propose(memory)
+        memory <- update(memory, their scores on a new minibatch of states)
+
+`iterate` runs this loop. Random search, TuRBO, PSO, CEM, DE, ARS and GC-PFO are three functions for
+it, each in its own module; VGDS, CMA-ES and BO have loops of their own.
+"""
 
 from __future__ import annotations
 
@@ -11,15 +20,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from shapebody.arguments import (
-    require_array,
-    require_integer,
-    require_key,
-    require_kind,
-)
-
-MOST = 1_000_000
-"""Largest number of iterations, candidates and the like."""
+from shapebody.arguments import require_array, require_integer, require_key, require_kind
 
 
 class Search(NamedTuple):
@@ -64,7 +65,7 @@ def iterate(objective, starts, key, config, steps: Steps, evaluations: int) -> S
     """
     starts = require_array("starts", starts, ("S", "d"))
     require_key("key", key)
-    require_kind("steps", steps, Steps, "three functions of the method, see there")
+    require_kind("steps", steps, Steps, "Steps(begin, propose, update)")
     require_integer("evaluations", evaluations)
     starts = jnp.asarray(starts)
     # Compiled here, once; threads that meet an uncompiled function would each compile it.
@@ -87,6 +88,7 @@ def cores() -> int:
 @partial(jax.jit, static_argnames=("config", "steps"))
 def _run(objective, start, key, config, steps: Steps):
     """Trajectory [N + 1, d] and history [N + 1] of one start [d]."""
+    # Minibatches are the same for all starts; the method's own random numbers are the start's.
     batch_keys = jax.random.split(key, config.iterations + 1)
     begin_key, *_ = iteration_keys = jax.random.split(start_key(key, start), len(batch_keys))
 
@@ -141,7 +143,7 @@ def start_key(key, start):
 def last_finite(trajectory, history):
     """The last designs [S, d] of a trajectory [N + 1, S, d] whose objective is finite.
 
-    The start, if there is none.
+    If it never is, this is the start.
     """
     rows = jnp.arange(len(history))[:, None]
     last = jnp.max(jnp.where(jnp.isfinite(history), rows, 0), axis=0)
@@ -149,7 +151,13 @@ def last_finite(trajectory, history):
 
 
 def initial_population(config, start, key):
-    """Initial population [P, d], the start [d] first; uniform, or Gaussian around the start."""
+    """Initial population [P, d] of PSO and DE: the start [d] first, the others uniform in the box.
+
+    The paper does not name one; this is the textbooks'. The mean of such a population is the centre
+    of the box, which is the reference design if that is f = 0: what PSO and DE gain by it, they
+    would gain without a critic too. With `config.initial_std`, the others are Gaussian around the
+    start instead.
+    """
     shape = (config.particles, len(start))
     if config.initial_std is None:
         others = jax.random.uniform(key, shape, minval=-1.0, maxval=1.0)

@@ -21,10 +21,10 @@ from shapebody.robot.robot import Robot, require_robot
 from shapebody.task.observations import Observation
 
 LARGEST_LAMBDA = 1e30
-"""Penalties of larger coefficients would leave single precision."""
+"""Penalties of larger coefficients would be too large for single precision."""
 
 MAX_ROWS = 8192
-"""Most (design, state) pairs that the critic sees at once (a state for every design at least)."""
+"""Most (design, state) pairs that the critic sees at once, but at least one state per design."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,7 +58,7 @@ def design_critic(robot: Robot, config: CriticConfig) -> DesignCritic:
     require_kind("config", config, CriticConfig, "shapebody.CriticConfig(...)")
     key = (robot.path, robot.xml, config)
     if key not in _critics:
-        # Padding has no influence, so the robot's own sizes do, and are the fastest.
+        # The robot's own sizes, without padding: it has no influence and costs time.
         _critics[key] = DesignCritic(DesignSpace(robot), describe(robot), Critic(config))
     return _critics[key]
 
@@ -72,24 +72,22 @@ class Objective:
     and foot observations, velocities, commands); everything that describes the body comes from
     Φ(f). A pytree: it can be an argument of jitted functions, and another λ, reference, critic or
     seed needs no new compilation.
-
-    Attributes:
-        critic: variables of the critic.
-        states: the state bank, an Observation with leading axis M.
-        reference: f_ref, float32 [d].
-        free: which entries of f count, bool [d]; the others are held at f_ref.
-        trust_region: λ, float32 [].
-        values: the critic as a function of designs and states.
-        batch_size: states per minibatch.
     """
 
     critic: Any
+    """Variables of the critic."""
     states: Observation
+    """The state bank, with leading axis M."""
     reference: jax.Array
+    """f_ref, float32 [d]."""
     free: jax.Array
+    """Which entries of f count, bool [d]; the others are held at f_ref."""
     trust_region: jax.Array
+    """λ, float32 []."""
     values: DesignCritic = field(metadata=dict(static=True))
+    """The critic as a function of designs and states."""
     batch_size: int = field(default=64, metadata=dict(static=True))
+    """States per minibatch."""
 
     @classmethod
     def of(
@@ -114,10 +112,9 @@ class Objective:
             frozen: parameters that are held at f_ref, see `DesignSpace.frozen`.
 
         Raises:
-            TypeError: for an agent or robot that is none, such as its name.
+            TypeError: if `agent` is not an `Agent` or `robot` is not a `Robot`, but a name.
             ValueError: for a λ that is negative or not finite, a wrong reference or batch size,
-                names of parameters that are not there, and an agent without states that fit the
-                robot.
+                unknown names of parameters, and an agent without states that fit the robot.
         """
         require_agent(agent)
         hint = "the penalty coefficient, 100 in the paper"
@@ -154,7 +151,7 @@ class Objective:
 
     def hold(self, designs):
         """Designs [..., d] with the frozen entries at f_ref."""
-        return jnp.where(self.free, self.values.space._float32(designs, jnp), self.reference)
+        return jnp.where(self.free, self.values.space.as_float32(designs, jnp), self.reference)
 
     def batch(self, key) -> Observation:
         """A minibatch of states, drawn without replacement; the whole bank if it is smaller."""
@@ -169,7 +166,7 @@ class Objective:
         designs = self.hold(designs)
         states = self.states if states is None else trim(states, self.values.space.robot)
         rows = designs.reshape(-1, designs.shape[-1])
-        return _mean_value(self, rows, states).reshape(designs.shape[:-1])
+        return mean_value(self, rows, states).reshape(designs.shape[:-1])
 
     def penalty(self, designs):
         """λ |f - f_ref|² / d for designs [..., d] -> [...]."""
@@ -186,7 +183,7 @@ class Objective:
 
 
 @jax.jit
-def _mean_value(objective: Objective, designs, states: Observation):
+def mean_value(objective: Objective, designs, states: Observation):
     """Mean value [S] of designs [S, d] over states and heads, in slices of the states."""
     descriptions = objective.values.descriptions(designs)
     count = states.general.shape[0]

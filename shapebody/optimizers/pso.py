@@ -1,4 +1,18 @@
-"""Particle swarm optimization (Appendix C)."""
+"""Particle swarm optimization (Appendix C: PSO).
+
+    x <- initial population, v <- 0
+    repeat N times
+        score the particles x on a new minibatch of states
+        own <- the best design of every particle so far, leader <- the best of all
+        v <- w v + c_1 r_1 (own - x) + c_2 r_2 (leader - x),   r_1, r_2 ~ U(0, 1), new for every
+                                                               particle and parameter
+        x <- clip(x + v), v <- what x has moved
+
+The paper does not say how the population begins: see `loop.initial_population`. A design that is
+kept keeps the value of the minibatch on which it was scored, as in the textbooks. A minibatch
+shifts the values of all designs by about the same, which is little compared with the differences
+that are still found at d > 300.
+"""
 
 from __future__ import annotations
 
@@ -8,12 +22,7 @@ import jax
 import jax.numpy as jnp
 
 from shapebody.configuration import Count, NonNegative, Positive, configuration
-from shapebody.optimizers.loop import (
-    Search,
-    Steps,
-    initial_population,
-    iterate,
-)
+from shapebody.optimizers.loop import Search, Steps, initial_population, iterate
 
 
 @configuration
@@ -25,9 +34,9 @@ class PSOConfig:
     inertia: NonNegative = 0.9
     """w, the part of a velocity that is kept."""
     cognitive: NonNegative = 0.5
-    """c_1, pull towards a particle's own best design."""
+    """c_1, attraction of a particle's own best design."""
     social: NonNegative = 0.3
-    """c_2, pull towards the best design of the swarm."""
+    """c_2, attraction of the best design of the swarm."""
     initial_std: Positive | None = None
     """Standard deviation of the initial particles around the start; uniform in the box if None."""
 
@@ -41,27 +50,25 @@ class _Swarm(NamedTuple):
 
 
 def pso(objective, starts, key, config: PSOConfig) -> Search:
-    """Global-best particle swarm optimization; returns the best design of the swarm.
+    """Particle swarm with one leader; returns the best design of the swarm.
 
-    v <- w v + c_1 r_1 (own best - x) + c_2 r_2 (swarm's best - x), x <- clip(x + v), with new
-    uniform r_1, r_2 for every particle and parameter. Particles begin at rest; at a face of the
-    box a velocity loses what would have led outside.
+    Particles begin at rest; at a face of the box a velocity loses what would have led outside.
     """
     evaluations = config.iterations * config.particles
-    return iterate(objective, starts, key, config, _PSO, evaluations)
+    return iterate(objective, starts, key, config, _STEPS, evaluations)
 
 
-def _pso_begin(config, start, key):
+def _begin(config, start, key):
     particles = initial_population(config, start, key)
     nothing = jnp.full(config.particles, -jnp.inf)
     return _Swarm(start, particles, jnp.zeros_like(particles), particles, nothing)
 
 
-def _pso_propose(config, memory, key):
+def _propose(config, memory, key):
     return memory.particles
 
 
-def _pso_update(config, memory, scored, key):
+def _update(config, memory, scored, key):
     better = scored.values > memory.best_values
     best = jnp.where(better[:, None], scored.designs, memory.best)
     best_values = jnp.maximum(scored.values, memory.best_values)
@@ -77,4 +84,4 @@ def _pso_update(config, memory, scored, key):
     return _Swarm(design, moved, moved - memory.particles, best, best_values)
 
 
-_PSO = Steps(_pso_begin, _pso_propose, _pso_update)
+_STEPS = Steps(_begin, _propose, _update)

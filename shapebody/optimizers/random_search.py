@@ -1,4 +1,12 @@
-"""Random search (Appendix C)."""
+"""Random search (Appendix C: Random).
+
+    repeat N times
+        draw P designs uniformly from [-1, 1]^d
+        score them on a new minibatch of states
+        best <- the best of them, if its value is above that of the best so far
+
+The value of the best is the one of the minibatch on which it was scored.
+"""
 
 from __future__ import annotations
 
@@ -27,26 +35,25 @@ class _Best(NamedTuple):
 
 
 def random(objective, starts, key, config: RandomConfig) -> Search:
-    """The design with the highest value among uniform draws from [-1, 1]^d.
+    """The design with the highest value among uniform draws from the box.
 
-    The start is only row 0 of the trajectory and the source of the random numbers: every start
-    has draws of its own, and its result may be worse than the start. A draw keeps the value of
-    the minibatch on which it was scored.
+    A start is only row 0 of its trajectory and the source of its random numbers: every start has
+    draws of its own, and what is found may be worse than the start.
     """
     evaluations = config.iterations * config.candidates
-    return iterate(objective, starts, key, config, _RANDOM, evaluations)
+    return iterate(objective, starts, key, config, _STEPS, evaluations)
 
 
-def _random_begin(config, start, key):
+def _begin(config, start, key):
     return _Best(start, jnp.float32(-jnp.inf))
 
 
-def _random_propose(config, memory, key):
+def _propose(config, memory, key):
     shape = (config.candidates, len(memory.design))
     return jax.random.uniform(key, shape, minval=-1.0, maxval=1.0)
 
 
-def _random_update(config, memory, scored, key):
+def _update(config, memory, scored, key):
     best = jnp.argmax(scored.values)
     better = scored.values[best] > memory.value
     return _Best(
@@ -55,4 +62,4 @@ def _random_update(config, memory, scored, key):
     )
 
 
-_RANDOM = Steps(_random_begin, _random_propose, _random_update)
+_STEPS = Steps(_begin, _propose, _update)

@@ -5,8 +5,16 @@ objective for minibatches of states (`objective.batch(key)`), values (`objective
 and their gradients, keeps designs inside [-1, 1] and returns one design per start, which does not
 depend on the other starts. What it returns is its own last recommendation: the last iterate of an
 ascent (VGDS, ARS), the mean of a distribution (CEM, CMA-ES), the best design of a population or of
-all draws. To add a method, write the function and a frozen dataclass of its settings, and enter
-both in `METHODS`; `loop.iterate` runs one that proposes designs and learns from their scores.
+all draws.
+
+To add a method:
+
+1. Write a module with a `@configuration` class of its settings, of which `iterations` is one.
+2. Write its function there. If the method proposes designs and learns from their scores, that is
+   one call of `loop.iterate` with three small functions: `cem` is a short example. Otherwise write
+   the loop yourself, as `vgds` does.
+3. Enter both in `METHODS`. `search`, the design studies and the tests of all methods
+   (tests/test_baselines.py) then know it.
 """
 
 from __future__ import annotations
@@ -65,34 +73,30 @@ METHODS: dict[str, Method] = {
 
 @dataclass(frozen=True, eq=False)
 class SearchResult:
-    """Outcome of a search from one design [d] or from S designs [S, d]; NumPy arrays, float32.
-
-    Attributes:
-        design: the found design(s), [d] or [S, d].
-        trajectory: designs from the start (row 0) to the end, [N + 1, d] or [N + 1, S, d].
-        objective: Ĵ_λ of `design` on the whole state bank, a float or [S].
-        history: Ĵ_λ along the trajectory, each on the minibatch of its iteration, [N + 1(, S)].
-        evaluations: number of designs that the method scored per start, each on one minibatch;
-            scores that only fill `history` are not counted.
-        seconds: wall time of the search for all starts, compilation included.
-        compile_seconds: the part of it that went into compilation; 0 when a search of the same
-            kind (method, settings, robot, size of the critic; VGDS also: number of starts) ran
-            before.
-        method: name of the method.
-        settings: all settings, including trust_region, seed, batch_size and the agent's hash;
-            reference is None if it was not given, else the first 16 digits of the SHA-256 of f_ref
-            as float32; states_hash is that of the agent's states, or of those given instead.
-    """
+    """Outcome of a search from one design [d] or from S designs [S, d]; NumPy arrays, float32."""
 
     design: np.ndarray
+    """The found design(s), [d] or [S, d]."""
     trajectory: np.ndarray
+    """Designs from the start (row 0) to the end, [N + 1, d] or [N + 1, S, d]."""
     objective: np.ndarray | float
+    """Ĵ_λ of `design` on the whole state bank, a float or [S]."""
     history: np.ndarray
+    """Ĵ_λ along the trajectory, each on the minibatch of its iteration, [N + 1] or [N + 1, S]."""
     evaluations: int
+    """Number of designs that the method scored per start, each on one minibatch. Scores that only
+    fill `history` are not counted."""
     seconds: float
+    """Wall time of the search for all starts, compilation included."""
     compile_seconds: float
+    """The part of it that went into compilation; 0 if a search of the same kind (method, settings,
+    robot, size of the critic; VGDS also: number of starts) ran before."""
     method: str
+    """Name of the method."""
     settings: dict
+    """All settings, including trust_region, seed, batch_size and the agent's hash. `reference` is
+    None if it was not given, else the first 16 digits of the SHA-256 of f_ref as float32;
+    `states_hash` is that of the agent's states, or of those given instead."""
 
 
 def search(
@@ -112,7 +116,7 @@ def search(
     """Search for a better design with a frozen agent (Section 3.2; baselines: Appendix C).
 
     Args:
-        method: a name in `METHODS`: "vgds"; its control without the critic, "penalty-only"; or a
+        method: a name in `METHODS`: "vgds"; "penalty-only", which is VGDS without the critic; or a
             baseline that maximizes the same objective: "random", "bo", "cma-es", "turbo", "pso",
             "cem", "de", "ars", "gc-pfo". The defaults of every method are the paper's settings.
             "bo" needs PyTorch (the extra `bo`).
@@ -123,16 +127,17 @@ def search(
         reference: f_ref [d], the anchor of the trust region; f = 0 if not given.
         seed: of the minibatches and of the method's own random numbers.
         batch_size: states per minibatch.
-        states: state bank to use instead of the agent's (see `objective.bank`).
+        states: state bank to use instead of the agent's (see `state_bank.bank`).
         frozen: parameters that stay as they are in f_ref, in the starts too, such as ("size",) or
             ("Torque limit", "Trunk"); see `DesignSpace.frozen`. None in the paper.
         **settings: fields of the method's configuration, such as iterations=50.
 
     Raises:
-        ValueError: for an unknown method or setting, a wrong design or reference, a negative λ, an
-            agent that does not fit the robot.
+        ValueError: for an unknown method or setting, a wrong design or reference, a negative λ, or
+            an agent that does not fit the robot.
         ImportError: for "bo" without PyTorch and BoTorch.
     """
+    # What is asked for: the method with its settings, the objective, the starts.
     function, config = _method(method, settings)
     require_seed("seed", seed)
     objective = Objective.of(agent, robot, trust_region, reference, states, batch_size, frozen)
@@ -143,6 +148,8 @@ def search(
             f"row of [S, {objective.dim}]"
         )
     single, starts = starts.ndim == 1, np.asarray(objective.hold(starts))
+
+    # The search, timed.
     began, compiled = time.perf_counter(), _compilation.seconds
     found = function(objective, jnp.atleast_2d(starts), jax.random.key(seed), config)
     # Methods that draw designs leave noise in entries that the objective does not see.
@@ -150,6 +157,8 @@ def search(
     found = jax.block_until_ready(Search(*held, found.history, found.evaluations))
     seconds = time.perf_counter() - began
     compile_seconds = min(_compilation.seconds - compiled, seconds)
+
+    # The result, without the axis of starts if one design was given.
     objectives = np.asarray(objective(found.designs))
 
     def out(values, axis):

@@ -21,7 +21,7 @@ def bank(agent: Agent, robot: Robot) -> Observation:
     For a robot that the agent was trained on, these are the states of that robot. Any other robot
     borrows all states of robots with at least as many joints and feet: its joint j is observed as
     joint j of the lender, and the joints it does not have are left out. States of smaller robots
-    are not used, because their padding is no observation of a foot.
+    are not used, because padding is not an observation of a foot.
 
     Raises:
         ValueError: if no state fits.

@@ -1,4 +1,15 @@
-"""TuRBO, a trust-region search (Appendix C)."""
+"""TuRBO, random search in a box that adapts (Appendix C: TuRBO).
+
+    r <- radius, f <- start
+    repeat N times
+        draw P designs uniformly from the box f ± r, clipped to [-1, 1]^d
+        score them, and f itself, on a new minibatch of states
+        if the best of them is better than f: f <- that one, r <- expand r
+        otherwise:                            r <- shrink r
+        clip r to [minimum_radius, maximum_radius]
+
+The paper's TuRBO has no Gaussian process, unlike the method that it is named after.
+"""
 
 from __future__ import annotations
 
@@ -8,11 +19,7 @@ import jax
 import jax.numpy as jnp
 
 from shapebody.configuration import Count, Positive, Share, configuration, number
-from shapebody.optimizers.loop import (
-    Search,
-    Steps,
-    iterate,
-)
+from shapebody.optimizers.loop import Search, Steps, iterate
 
 
 @configuration
@@ -33,10 +40,14 @@ class TuRBOConfig:
 
     def __post_init__(self):
         low, high = self.minimum_radius, self.maximum_radius
+        if low > high:
+            raise ValueError(
+                f"minimum_radius is {low}; expected at most maximum_radius, which is {high}"
+            )
         if not low <= self.radius <= high:
             raise ValueError(
-                f"radius is {self.radius}; expected minimum_radius <= radius <= maximum_radius, "
-                f"which are {low} and {high}"
+                f"radius is {self.radius}; expected a number from minimum_radius to "
+                f"maximum_radius, which are {low} and {high}"
             )
 
 
@@ -48,25 +59,24 @@ class _TrustBox(NamedTuple):
 def turbo(objective, starts, key, config: TuRBOConfig) -> Search:
     """Uniform draws from a box around the best design, whose size adapts to success.
 
-    The paper's TuRBO has no Gaussian process. If the best candidate of an iteration is better than
-    the centre, it becomes the centre and the box grows; otherwise the box shrinks. The centre is
-    scored anew with the candidates, so that both are compared on the same states.
+    The centre is scored again in every iteration, so that it is compared with the candidates on
+    the same states.
     """
     evaluations = config.iterations * (config.candidates + 1)
-    return iterate(objective, starts, key, config, _TURBO, evaluations)
+    return iterate(objective, starts, key, config, _STEPS, evaluations)
 
 
-def _turbo_begin(config, start, key):
+def _begin(config, start, key):
     return _TrustBox(start, jnp.float32(config.radius))
 
 
-def _turbo_propose(config, memory, key):
+def _propose(config, memory, key):
     shape = (config.candidates, len(memory.design))
     offsets = jax.random.uniform(key, shape, minval=-1.0, maxval=1.0)
     return jnp.clip(memory.design + memory.radius * offsets, -1.0, 1.0)
 
 
-def _turbo_update(config, memory, scored, key):
+def _update(config, memory, scored, key):
     best = jnp.argmax(scored.values)
     better = scored.values[best] > scored.current
     radius = memory.radius * jnp.where(better, config.expand, config.shrink)
@@ -76,4 +86,4 @@ def _turbo_update(config, memory, scored, key):
     )
 
 
-_TURBO = Steps(_turbo_begin, _turbo_propose, _turbo_update)
+_STEPS = Steps(_begin, _propose, _update)

@@ -1,4 +1,11 @@
-"""Value-Gradient Design Search (Section 3.2): clipped Adam ascent on the design objective."""
+"""Value-Gradient Design Search (VGDS, Section 3.2): clipped Adam ascent on the design objective.
+
+    repeat N times
+        draw a minibatch B of states
+        f <- clip[-1, 1](f + clip[-δ_max, δ_max](Adam(∇ Ĵ_{λ,B}(f))))            (eq. 6 and 7)
+
+"Penalty only" is the same search without the critic.
+"""
 
 from __future__ import annotations
 
@@ -9,11 +16,7 @@ import jax.numpy as jnp
 import optax
 
 from shapebody.configuration import Count, Positive, configuration
-from shapebody.optimizers.loop import (
-    Search,
-    last_finite,
-    values_and_gradients,
-)
+from shapebody.optimizers.loop import Search, last_finite, values_and_gradients
 
 
 @configuration
@@ -29,17 +32,16 @@ class VGDSConfig:
 
 
 def vgds(objective, starts, key, config: VGDSConfig) -> Search:
-    """Gradient ascent on Ĵ_λ (eq. 6 and 7) from designs `starts` [S, d].
+    """Gradient ascent on Ĵ_λ from designs `starts` [S, d].
 
-    f_{n+1} = clip[-1, 1](f_n + clip[-δ_max, δ_max](Adam(∇ Ĵ_{λ,B}(f_n)))), with a new minibatch
-    B of states in every iteration. All starts share the minibatches: they are compared on the same
-    states, and the result of a start does not depend on the others.
+    All starts share the minibatches: they are compared on the same states, and the result of a
+    start does not depend on the others.
     """
     return _ascend(objective, starts, key, config, True)
 
 
 def penalty_only(objective, starts, key, config: VGDSConfig) -> Search:
-    """VGDS with the value gradient set to zero: the control that follows the trust region alone.
+    """VGDS with the value gradient set to zero: ascent on the trust-region penalty only.
 
     What it gains is due to the reference design and not to the critic. `history` still holds Ĵ_λ.
     """

@@ -1,4 +1,4 @@
-"""The paper's numbers, and the studies beside which ours stand."""
+"""The paper's numbers, and our studies to be compared with them."""
 
 import lazy_loader
 
@@ -6,7 +6,6 @@ __getattr__, __dir__, __all__ = lazy_loader.attach(
     __name__,
     submodules=[
         "critic_ablation",
-        "derived_constants",
         "design_study",
         "gains",
         "paper",

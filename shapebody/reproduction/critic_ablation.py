@@ -1,6 +1,6 @@
 """Several critics of one policy, judged by what they are for: order bodies, and find better ones.
 
-The controls are the same start designs (Section 4.1), and the pull of the trust region alone.
+All search from the same start designs (Section 4.1), and are compared with penalty only.
 """
 
 import numpy as np
@@ -34,17 +34,17 @@ def compare_critics(
     horizon: int = 1000,
     seed: int = 0,
 ) -> list[dict]:
-    """VGDS with each critic and each λ, and the penalty alone, on the same episodes.
+    """VGDS with each critic and each λ, and penalty only, on the same episodes.
 
     Args:
         critics: by name, agents for `robot` with one and the same policy.
         trust_regions: the λ.
         starts, first_start: number of start designs, and the number of the first. The paper's are
-            0 to 9; from 30 on, none has decided about a setting here.
+            0 to 9; on those from 30 on, no setting has been chosen here.
         episodes, horizon, seed: of the evaluation.
 
     Returns:
-        One record per found design: critic and trust_region (None for the penalty alone), start
+        One record per found design: critic and trust_region (None for penalty only), start
         number, the returns of all episodes, tracking error (m/s), length (control steps), the three
         entries of f that scale the body along its axes, and the distance |f - f_ref| / sqrt(d).
 
@@ -66,16 +66,19 @@ def compare_critics(
             "or the returns differ for another reason"
         )
     space = DesignSpace(robot)
+    # The searches.
     numbers = range(first_start, first_start + starts)
     initial = np.stack([space.start(i) for i in numbers])
     first = next(iter(critics.values()))
 
-    # The penalty alone asks no critic, so any agent will do.
+    # Penalty only asks no critic, so any agent will do.
     found = {(None, None): search("penalty-only", first, robot, initial, seed=seed).design}
     for name, agent in critics.items():
         for value in trust_regions:
             run = search("vgds", agent, robot, initial, trust_region=value, seed=seed)
             found[name, value] = run.design
+
+    # The episodes, the same for all found designs.
     designs = np.concatenate(list(found.values()))
     config = EvaluationConfig(episodes=episodes, task=TaskConfig.evaluation(horizon=horizon))
     score = evaluate(first, robot, designs, seed=seed, config=config)
@@ -104,27 +107,27 @@ def _require_critics(critics) -> None:
 
 
 def critic_gains(records: list[dict]) -> list[dict]:
-    """What each critic adds to the penalty alone, from the records of `compare_critics`.
+    """What each critic adds to penalty only, from the records of `compare_critics`.
 
     Returns:
         One row per critic and λ: mean gain in return with its 95 % interval over starts and
         episodes (low, high), the number of starts and of those that gain, mean tracking error
-        (m/s), mean length (control steps) and mean size entries [3]; first the penalty alone,
-        whose gain is None.
+        (m/s), mean length (control steps) and mean size entries [3]; first penalty only, whose
+        gain is None.
     """
     groups: dict = {}
     columns = ("critic", "trust_region", "returns", "tracking_error", "length", "size")
     for record in require_records("records", records, columns):
         groups.setdefault((record["critic"], record["trust_region"]), []).append(record)
     if (None, None) not in groups:
-        raise ValueError("records hold no penalty alone; expected those of compare_critics")
-    control = [record["returns"] for record in groups[None, None]]
+        raise ValueError("records hold no penalty only; expected those of compare_critics")
+    penalty = [record["returns"] for record in groups[None, None]]
     rows = []
     for (critic, value), group in groups.items():
         row = {"critic": critic, "trust_region": value, "pairs": len(group)}
         row |= dict.fromkeys(("mean", "low", "high", "positive"))
         if critic is not None:
-            gain = paired_gain([record["returns"] for record in group], control)
+            gain = paired_gain([record["returns"] for record in group], penalty)
             positive = int(np.sum(gain.differences > 0))
             row |= dict(mean=gain.mean, low=gain.low, high=gain.high, positive=positive)
         for name in ("tracking_error", "length"):
@@ -138,8 +141,8 @@ def critic_correlations(critics: dict, robot, records: list[dict]) -> dict[str, 
     """Spearman's ρ of each critic's value and the return, with its 95 % interval.
 
     Args:
-        records: of `studies.value_against_return` for the policy that all critics share; the
-            designs and the returns in them do not depend on a critic.
+        records: of `value_against_return` for the policy that all critics share; the designs and
+            the returns in them do not depend on a critic.
     """
     _require_critics(critics)
     space = DesignSpace(robot)
@@ -157,9 +160,9 @@ def critic_tasks(old, new, robot, **changes) -> dict:
     """Is a critic better that was trained on the task on which designs are evaluated?
 
     data/results/critic_tasks_<robot>.json is this with `new`, the shipped agent, and `old`, the one
-    shipped before it (in the history of this repository, commit 1568810), whose critic was trained
-    as long on the task of the policy's training: `train_critic(new, CriticConfig.sharp(),
-    6_000_000, task_of="training")`.
+    shipped before it (in the history of this repository, commit 1568810). Its critic was trained
+    for as many steps on the task of the policy's training: `train_critic(new,
+    CriticConfig.sharp(), 6_000_000, task_of="training")`.
 
     Args:
         changes: settings of `compare_critics`.

@@ -37,29 +37,30 @@ class Run(NamedTuple):
     method: str
     """A name in `search.METHODS`."""
     trust_region: float | None = 100.0
-    """λ. None for the penalty alone: Adam removes the scale of its gradient, so it has none."""
+    """λ; None for penalty only, where it has no influence: Adam removes the scale of a gradient."""
     origin: str = "start"
     """"start": from the paper's start designs, all in one batch; "reference": from f = 0."""
 
 
-CONTROL = Run("penalty-only", None)
+PENALTY_ONLY = Run("penalty-only", None)
+"""What is gained without the critic, with which the gains of all other runs are compared."""
 
-TRUST_REGION_RUNS = (CONTROL, *(Run("vgds", float(value)) for value in paper.LAMBDAS))
-"""VGDS at all λ of Appendix D, and its control."""
+TRUST_REGION_RUNS = (PENALTY_ONLY, *(Run("vgds", float(value)) for value in paper.LAMBDAS))
+"""VGDS at all λ of Appendix D, and penalty only."""
 
 SINGLE_ROBOT_RUNS = (
-    CONTROL,
+    PENALTY_ONLY,
     Run("vgds", 20.0),
     Run("vgds", 100.0),
     Run("vgds", 20.0, "reference"),
     Run("vgds", 100.0, "reference"),
 )
-"""What the critic adds to the pull of the trust region, from afar and from the reference."""
+"""What the critic adds to penalty only, from the starts; and VGDS from the reference."""
 
-FRESH_RUNS = (CONTROL, *(Run("vgds", value) for value in (20.0, 50.0, 100.0, 200.0)))
-"""To be repeated from other start designs than the paper's, which have decided nothing."""
+FRESH_RUNS = (PENALTY_ONLY, *(Run("vgds", value) for value in (20.0, 50.0, 100.0, 200.0)))
+"""For other start designs than the paper's, on which no setting has been chosen."""
 
-METHOD_RUNS = (CONTROL, *(Run(name) for name in METHODS if name != "penalty-only"))
+METHOD_RUNS = (PENALTY_ONLY, *(Run(name) for name in METHODS if name != "penalty-only"))
 """All methods at the paper's λ (Section 4.1, Appendix C)."""
 
 
@@ -83,17 +84,17 @@ def design_study(
     a file of its own for every robot file.
 
     Args:
-        agent, robot: who is asked, and about which robot.
+        agent, robot: the frozen agent, and the robot to be designed.
         runs: the searches.
         starts: number of start designs.
         episodes: least number of evaluation episodes per design. A stored study of more is used
-            as it is, and what it lacks is computed with as many; to have fewer, delete its file.
+            as it is, and its missing runs are computed with as many.
         seed: of the searches and of the evaluation.
         iterations: of every search; the paper's number for each method if not given.
         first_start: number of the first start design. The paper's are 0 to 9; others have a file
             of their own.
-        recompute: search and evaluate anew.
-        progress: print a line per run.
+        recompute: search and evaluate again, and overwrite what is stored.
+        progress: print a line per run that is computed.
 
     Returns:
         {"records": ..., "provenance": ...} with one record per design: origin, start number,
@@ -105,7 +106,8 @@ def design_study(
         objective (on the whole state bank) at some of its iterations.
 
     Raises:
-        ValueError: for a run or a setting that cannot be, before anything is computed.
+        ValueError: for a run or a setting that is not possible, before anything is computed; if
+            the stored study is another agent's or has other settings, unless `recompute`.
     """
     require_agent(agent)
     require_robot(robot)
@@ -117,30 +119,30 @@ def design_study(
     setting = _as_stored(name, agent, setting, short)
     parts = {"starts and reference": partial(_initial_records, agent, robot, **setting)}
     for run in runs:
-        parts[_part(run)] = partial(_run_records, agent, robot, run, short, **setting)
+        parts[part_name(run)] = partial(_run_records, agent, robot, run, short, **setting)
     return result_in_parts(
-        name, parts, agent, recompute, progress, _searches(runs, short), **setting, **short
+        name, parts, agent, recompute, progress, search_settings(runs, **short), **setting, **short
     )
 
 
 def _settings(runs, starts, episodes, horizon, seed, first_start, iterations, recompute):
-    """(runs, setting, settings of every search) of a study; ValueError for what cannot be."""
-    _require_counts(starts=starts, episodes=episodes, horizon=horizon)
+    """(runs, setting, settings of every search) of a study; ValueError for what is not possible."""
+    require_counts(starts=starts, episodes=episodes, horizon=horizon)
     for name, value in (("seed", seed), ("first_start", first_start)):
         require_integer(name, value, 0, 1_000_000)
     setting = _setting(starts, episodes, horizon, seed, first_start)
     short = {} if iterations is None else {"iterations": iterations}
     runs = require_list("runs", runs)
     for run in runs:
-        require_kind("a run", run, Run, 'for example studies.Run("vgds", 100.0)')
+        require_kind("a run", run, Run, 'for example design_study.Run("vgds", 100.0)')
         _validate(run, short)
     require_flag("recompute", recompute)
     return runs, setting, short
 
 
-def _searches(runs, short: dict) -> dict[str, dict]:
-    """By name of the part, the settings of its search."""
-    return {_part(run): asdict(METHODS[run.method].config(**short)) for run in runs}
+def search_settings(runs, **settings) -> dict[str, dict]:
+    """The settings of the runs' searches by `part_name`; those not given are the methods'."""
+    return {part_name(run): asdict(METHODS[run.method].config(**settings)) for run in runs}
 
 
 def _setting(starts, episodes, horizon, seed, first_start) -> dict:
@@ -161,16 +163,17 @@ def _validate(run: Run, settings: dict) -> None:
     if not isinstance(run.method, str) or run.method not in METHODS:
         raise ValueError(f"unknown method in {shown(run)}; known: {', '.join(METHODS)}")
     require_choice("origin of a run", run.origin, ("start", "reference"))
-    value, alone = run.trust_region, run.method == CONTROL.method
-    if alone and value is not None:
-        raise refuse(f"trust_region of {run.method}", value, "None, it has no λ")
-    if not alone:
+    value = run.trust_region
+    if run.method == PENALTY_ONLY.method:
+        if value is not None:
+            raise refuse(f"trust_region of {run.method}", value, "None, since λ has no influence")
+    else:
         require_number(f"trust_region of {run.method}", value, 0)
     METHODS[run.method].config(**settings)  # refuses what the method cannot use
 
 
 def _file(robot, first_start: int) -> str:
-    """Name of a study's file. A robot that is not the shipped one of its name has its own."""
+    """Name of a study's file. A robot that differs from the shipped one of its name has its own."""
     shipped = data_dir() / "robots" / f"{robot.name}.xml"
     known = shipped.is_file() and shipped.read_text(encoding="utf-8") == robot.xml
     suffix = "" if known else f"_{robot.hash}"
@@ -178,19 +181,20 @@ def _file(robot, first_start: int) -> str:
     return f"design_study_{robot.name}{suffix}"
 
 
-def _part(run: Run) -> str:
+def part_name(run: Run) -> str:
+    """Name of a run's part in the file of a study, such as "vgds, lambda 20, from the starts"."""
     text = "" if run.trust_region is None else f", lambda {run.trust_region:g}"
     where = "starts" if run.origin == "start" else run.origin
     return f"{run.method}{text}, from the {where}"
 
 
 def installed(runs) -> tuple[Run, ...]:
-    """Those of `runs` whose libraries are there: "bo" needs the extra `bo`."""
+    """Those of `runs` whose libraries are installed: "bo" needs the extra `bo`."""
     from importlib.util import find_spec
 
     runs = require_list("runs", runs)
     for run in runs:
-        require_kind("a run", run, Run, 'for example studies.Run("vgds", 100.0)')
+        require_kind("a run", run, Run, 'for example design_study.Run("vgds", 100.0)')
     return tuple(run for run in runs if run.method != "bo" or find_spec("botorch"))
 
 
@@ -208,7 +212,7 @@ def available(
 ) -> tuple[Run, ...]:
     """Those of `runs` that `design_study` can return here for the same arguments.
 
-    All but "bo" always; "bo" where its libraries are `installed`, or where its part is stored.
+    That is all of them, but "bo" only if its libraries are `installed` or its part is stored.
     """
     require_agent(agent)
     require_robot(robot)
@@ -217,10 +221,10 @@ def available(
     )
     name = _file(robot, first_start)
     setting = _as_stored(name, agent, setting, short)
-    searches = _searches(runs, short)
+    searches = search_settings(runs, **short)
     stored = [] if recompute else stored_parts(name, agent, searches, **setting, **short)
     here = installed(runs)
-    return tuple(run for run in runs if run in here or _part(run) in stored)
+    return tuple(run for run in runs if run in here or part_name(run) in stored)
 
 
 CURVE_POINTS = 21
@@ -272,7 +276,7 @@ def _run_records(agent, robot, run: Run, short, starts, seed, first_start=0, **s
 def _evaluated(agent, robot, run: Run, numbers, designs, seed, episodes, horizon):
     """A record per design; `numbers` are those of the start designs they came from."""
     predicted = Objective.of(agent, robot, 0.0).value(designs)
-    score = evaluate(agent, robot, designs, seed=seed, config=_evaluation(episodes, horizon))
+    score = evaluate(agent, robot, designs, seed=seed, config=evaluation_config(episodes, horizon))
     return [
         {
             "origin": run.origin,
@@ -292,10 +296,12 @@ def _evaluated(agent, robot, run: Run, numbers, designs, seed, episodes, horizon
     ]
 
 
-def _evaluation(episodes: int, horizon: int):
+def evaluation_config(episodes: int, horizon: int) -> EvaluationConfig:
+    """How the studies evaluate designs: episodes of `horizon` control steps."""
     return EvaluationConfig(episodes=episodes, task=TaskConfig.evaluation(horizon=horizon))
 
 
-def _require_counts(**counts) -> None:
+def require_counts(**counts) -> None:
+    """ValueError if one of the named numbers is not an integer from 1 to 1,000,000."""
     for name, value in counts.items():
         require_integer(name, value, 1, 1_000_000)

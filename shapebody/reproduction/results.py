@@ -1,20 +1,31 @@
-"""Results that are kept in data/results with their provenance."""
+"""Results that are kept in data/results, each with its provenance.
+
+The file of a result belongs to one agent and to one choice of settings. It holds parts, each with
+its records; `result` makes files of one part. Parts are written as soon as they are computed, one
+file at a time and whole: a computation that was interrupted goes on with what is missing, and
+several processes may compute different parts.
+"""
 
 import json
 import os
-import shutil
 import time
 from collections.abc import Callable
 from pathlib import Path
+from typing import NotRequired
 
+import pandas as pd
+import pydantic
+from typing_extensions import TypedDict
+
+from shapebody.agent.agent import require_agent
 from shapebody.arguments import (
-    refuse,
     require_flag,
     require_function,
     require_kind,
     require_name,
     require_number,
     require_path,
+    require_records,
     shown,
 )
 from shapebody.files import atomic_write, data_dir, locked
@@ -22,22 +33,7 @@ from shapebody.provenance import provenance
 from shapebody.reproduction.scale import scale
 from shapebody.stored import read_json
 
-
-def result_provenance(agent=None, seconds: float | None = None, **config) -> dict:
-    """Where a result comes from: settings, agent, versions, commit, machine, seconds."""
-
-    record = {"config": config, "scale": scale(), **provenance()}
-    if agent is not None:
-        _require_agent(agent)
-        record["agent"] = {
-            "name": agent.name,
-            "hash": agent.hash,
-            "states_hash": agent.states_hash,
-            "steps": agent.metadata.get("steps"),
-        }
-    if seconds is not None:
-        record["seconds"] = round(require_number("seconds", seconds, 0), 1)
-    return record
+# ------------------------------------------------------------------ computing and loading
 
 
 def result(name: str, compute: Callable[[], list[dict]], agent=None, recompute=False, **config):
@@ -49,12 +45,17 @@ def result(name: str, compute: Callable[[], list[dict]], agent=None, recompute=F
     Args:
         name: of the experiment.
         compute: returns tidy records, a list of flat dictionaries.
-        agent: the agent that the result depends on; a result of another agent is not loaded.
-        recompute: compute anew and overwrite.
-        config: settings that the result depends on; other settings mean another result.
+        agent: the agent that the result depends on.
+        recompute: compute again, and overwrite what is stored.
+        config: settings that the result depends on.
 
     Returns:
-        {"records": [...], "provenance": {...}}.
+        {"records": [...], "provenance": {...}}; `frame` makes a table of it.
+
+    Raises:
+        ValueError: if the file is damaged, or belongs to another agent or to other settings; not
+            with `recompute`.
+        OSError: if the file cannot be written; the old one stays.
     """
     require_function("compute", compute)
     return result_in_parts(name, {"all": compute}, agent, recompute, **config)
@@ -69,17 +70,15 @@ def result_in_parts(
     settings: dict[str, dict] | None = None,
     **config,
 ):
-    """`result` for long computations: each part is stored as soon as it is done.
+    """`result` for long computations: each part is stored as soon as it is computed.
 
-    A computation that was interrupted goes on with the first part that is missing. The file may
-    hold more parts than are asked for, and other processes may add theirs meanwhile. A file of
-    another agent or of other settings is not overwritten: it is renamed to <name>.old.json. So is
-    one in which a part has other settings of its own; the rest of it is used.
+    The file may hold more parts than are asked for, and other processes may add theirs meanwhile.
 
     Args:
         name, agent, config: see `result`.
-        recompute: compute these parts anew; others in the file stay.
         parts: by name, functions that return the records of one part.
+        recompute: compute these parts again. Others stay, unless the file is another agent's or has
+            other settings: it is then replaced.
         progress: print a line per part that is computed.
         settings: by name of the part, what this part alone depends on.
 
@@ -88,52 +87,123 @@ def result_in_parts(
         sum over these parts.
 
     Raises:
-        ValueError: for a damaged file, unless `recompute`, which keeps it as <name>.old.json.
-        OSError: if the file cannot be written; the old one stays.
+        ValueError, OSError: see `result`.
     """
-    path, kept = result_path(name), scale() != "smoke"
-    for label, value in (("recompute", recompute), ("progress", progress)):
-        require_flag(label, value)
     for part, compute in _require_parts("parts", parts).items():
         require_function(f"parts[{part!r}]", compute)
+    require_flag("recompute", recompute)
+    require_flag("progress", progress)
     settings = {} if settings is None else _require_parts("settings", settings)
-    _require_agent(agent)
-    _require_json("config", config)
-    known, _ = _usable_parts(path, agent, config, settings, recompute) if kept else ({}, False)
-    if recompute or parts.keys() - known.keys():
+    file = _File(name, agent, config)
+
+    # What is stored already.
+    known = {} if recompute else file.read()
+    for part in parts.keys() & known.keys():
+        if other := _other_settings(known[part], settings.get(part)):
+            raise ValueError(f"{part!r} in {file.path} has other settings: {other}; {FIX}")
+    missing = [part for part in parts if part not in known]
+    if missing:
         provenance()  # reads the commit of the code that is about to run
-    computed = {}
-    for number, (part, compute) in enumerate(parts.items(), 1):
-        if part in known and not recompute:
-            continue
+
+    # What is not, part by part.
+    for number, part in enumerate(missing, 1):
         began = time.perf_counter()
-        records = compute()
+        records = parts[part]()
         source = result_provenance(agent, time.perf_counter() - began, **config)
         if part in settings:
             source["settings"] = settings[part]
-        computed[part] = {"records": records, "provenance": source}
-        if kept:
-            with locked(path):
-                # Read again: another process may have added parts in the meantime.
-                stored, another = _usable_parts(path, agent, config, settings, overwrite=True)
-                _write_parts(path, known | stored | computed, another)
+        known[part] = {"records": records, "provenance": source}
+        file.add(part, known[part], replace=recompute)
         if progress:
             seconds = source["seconds"]
-            print(f"{number} of {len(parts)}: {part}, {seconds:.0f} s", flush=True)
-    known |= computed
+            print(f"{number} of {len(missing)}: {part}, {seconds:.0f} s", flush=True)
     return _joined([known[part] for part in parts])
+
+
+def frame(records) -> pd.DataFrame:
+    """The records of a result as a table with a row per record.
+
+    None is NaN in a column of numbers, such as the λ of penalty only.
+
+    Args:
+        records: a list of records, or what `result`, `design_study` and the like return.
+    """
+    if isinstance(records, pd.DataFrame):
+        return records
+    if isinstance(records, dict) and "records" in records:
+        records = records["records"]
+    return pd.DataFrame(require_records("records", records, ()))
+
+
+# ------------------------------------------------------------------ looking at what is stored
 
 
 def stored_result(path) -> dict:
     """What `result` returned when it wrote that file.
 
-    Raises FileNotFoundError if it is missing, ValueError if it is damaged.
+    Raises:
+        FileNotFoundError: if the file does not exist.
+        ValueError: if it is damaged.
     """
-    fix = "restore it, or delete it and compute it anew"
-    parts = _read_parts(require_path("path", path), fix)
+    fix = "restore it, or delete it and compute it again"
+    parts = _read(require_path("path", path), fix)
     if not parts:
         raise ValueError(f"{path} holds no parts; {fix}")
     return _joined(list(parts.values()))
+
+
+def stored_parts(name: str, agent=None, settings=None, **config) -> list[str]:
+    """Names of the parts that `result_in_parts` would load for these arguments."""
+    settings = {} if settings is None else _require_parts("settings", settings)
+    file = _File(name, agent, config)
+    if not file.kept or not os.path.lexists(file.path):
+        return []
+    parts = _read(file.path, FIX)
+    if file.other(parts, file.config):
+        return []
+    return [part for part in parts if not _other_settings(parts[part], settings.get(part))]
+
+
+def stored_config(name: str, agent=None) -> dict | None:
+    """The settings of the stored result of that name and agent; None where there is none.
+
+    A damaged file has none: `result` says what is wrong with it.
+    """
+    file = _File(name, agent, {})
+    if not file.kept:
+        return None
+    try:
+        parts = _read(file.path, FIX)
+    except (FileNotFoundError, ValueError):
+        return None
+    config = next(iter(parts.values()))["provenance"]["config"] if parts else None
+    return None if file.other(parts, config) else config
+
+
+def result_path(name: str) -> Path:
+    """Where `result` keeps that experiment at the scale in force."""
+    suffix = "" if scale() == "reduced" else f"_{scale()}"
+    require_name("name", name)
+    return data_dir() / "results" / f"{name}{suffix}.json"
+
+
+def result_provenance(agent=None, seconds: float | None = None, **config) -> dict:
+    """Where a result comes from: settings, scale, agent, versions, commit, machine, seconds."""
+    record = {"config": config, "scale": scale(), **provenance()}
+    if identity := _identity(agent):
+        steps = agent.metadata.get("steps")
+        record["agent"] = {"name": agent.name, **identity, "steps": steps}
+    if seconds is not None:
+        record["seconds"] = round(require_number("seconds", seconds, 0), 1)
+    return record
+
+
+def _identity(agent) -> dict:
+    """What tells an agent from others; nothing for None. TypeError if it is not an `Agent`."""
+    if agent is None:
+        return {}
+    require_agent(agent)
+    return {"hash": agent.hash, "states_hash": agent.states_hash}
 
 
 def _joined(parts: list[dict]) -> dict:
@@ -145,167 +215,106 @@ def _joined(parts: list[dict]) -> dict:
     }
 
 
-def _write_parts(path: Path, parts: dict, another: bool) -> None:
-    """Write a result's file; if it was another result's, that is kept beside it.
+# ------------------------------------------------------------------ files
 
-    The old file is at its place until the new one takes it, and stays if the disk is full.
-    """
-    old = None
-    if another:
-        number, old = 1, path.with_suffix(".old.json")
-        while old.exists():
-            number += 1
-            old = path.with_suffix(f".old{number}.json")
+FIX = "delete it, or call with recompute=True, which overwrites it"
+
+
+class _File:
+    """The file of a result at the scale in force, for one agent and one choice of settings."""
+
+    def __init__(self, name: str, agent, config: dict):
+        self.path, self.kept = result_path(name), scale() != "smoke"
+        self.agent, self.config = _identity(agent), _as_json("config", config)
+
+    def read(self, replace: bool = False) -> dict[str, dict]:
+        """The stored parts; ValueError if they are damaged or belong to another result.
+
+        With `replace`, such a file counts as empty, because it will be overwritten.
+        """
+        if not self.kept or not os.path.lexists(self.path):
+            return {}
         try:
-            os.link(path, old)
-        except OSError:  # a file system without links
-            shutil.copyfile(path, old)
-    try:
-        atomic_write(path, _one_record_per_line(parts))
-    except BaseException:
-        if old is not None:
-            old.unlink(missing_ok=True)
-        raise
-    if old is not None:
-        print(f"{path.name} was of another agent or other settings, or damaged: kept as {old.name}")
+            parts = _read(self.path, FIX)
+            if other := self.other(parts, self.config):
+                raise ValueError(f"{self.path} is of another result: {other}; {FIX}")
+        except ValueError:
+            if replace and self.path.is_file():
+                return {}
+            raise
+        return parts
+
+    def other(self, parts: dict, config: dict) -> str:
+        """How the agent or the settings of stored parts differ; "" if they are the same."""
+        for part in parts.values():
+            source = part["provenance"]
+            agent = {key: source.get("agent", {}).get(key) for key in self.agent}
+            if difference := _difference(agent, self.agent):
+                return f"its agent's {difference}"
+            if difference := _difference(source["config"], config):
+                return difference
+        return ""
+
+    def add(self, name: str, part: dict, replace: bool) -> None:
+        """Write a part into the file, beside those that other processes may have added."""
+        if self.kept:
+            with locked(self.path):
+                parts = self.read(replace) | {name: part}
+                atomic_write(self.path, _one_record_per_line(parts))
 
 
-def stored_parts(name: str, agent=None, settings=None, **config) -> list[str]:
-    """Names of the parts that `result_in_parts` would load for these arguments."""
-    path, settings = result_path(name), {} if settings is None else settings
-    _require_parts("settings", settings)
-    _require_agent(agent)
-    _require_json("config", config)
-    if scale() == "smoke":
-        return []
-    return list(_usable_parts(path, agent, config, settings, False)[0])
-
-
-def stored_config(name: str, agent=None) -> dict | None:
-    """The settings of the stored result of that name and agent; None where there is none.
-
-    A damaged file has none: whoever wants its records is told.
-    """
-    path = result_path(name)
-    _require_agent(agent)
-    if scale() == "smoke" or not path.exists():
-        return None
-    try:
-        parts = _read_parts(path, "")
-    except ValueError:
-        return None
-    config = next(iter(parts.values()))["provenance"]["config"] if parts else None
-    return config if _of_agent(parts, agent, config) else None
-
-
-def result_path(name: str) -> Path:
-    """Where `result` keeps that experiment at the scale in force."""
-    suffix = "" if scale() == "reduced" else f"_{scale()}"
-    require_name("name", name)
-    return data_dir() / "results" / f"{name}{suffix}.json"
-
-
-def _require_agent(agent) -> None:
-    """TypeError if an agent that may be None lacks what tells one from another."""
-    if agent is not None and not all(hasattr(agent, name) for name in ("hash", "states_hash")):
-        hint = "load it with shapebody.load_agent(...)"
-        raise refuse("agent", agent, "an Agent", hint, TypeError)
-
-
-def _require_parts(name: str, parts) -> dict:
-    """The dictionary; TypeError if it is none, or if its keys are no texts."""
-    require_kind(name, parts, dict, "by name of the part")
-    for part in parts:
-        require_kind(f"a key of {name}", part, str, "the name of a part")
-    if name == "parts" and not parts:
-        raise ValueError("parts is {}; expected at least one part")
-    return parts
-
-
-def _require_json(name: str, value) -> None:
-    """ValueError if a value cannot be written as JSON."""
-    try:
-        json.dumps(value)
-    except (TypeError, ValueError) as error:
-        raise ValueError(
-            f"{name} is {shown(value)}, which JSON cannot hold ({error}); expected numbers, texts, "
-            "lists and dictionaries"
-        ) from error
-
-
-def _usable_parts(path, agent, config, settings: dict, overwrite: bool) -> tuple[dict, bool]:
-    """(the parts in a result's file that belong to this agent and these settings, whether the
-    file holds anything else).
-
-    A damaged file has none if it is to be overwritten anyway.
-    """
-    if not os.path.lexists(path):
-        return {}, False
-    try:
-        known = _read_parts(path, "delete it, or call with recompute=True")
-    except ValueError:
-        if overwrite and path.is_file():
-            return {}, True
-        raise
-    config = json.loads(json.dumps(config))
-    if not _of_agent(known, agent, config):
-        return {}, True
-    fitting = {part: one for part, one in known.items() if _fits(one, settings.get(part))}
-    return fitting, len(fitting) < len(known)
-
-
-def _of_agent(parts: dict, agent, config) -> bool:
-    """Whether all parts, at least one, are of this agent (if one is given) and these settings."""
-    agent = {} if agent is None else {"hash": agent.hash, "states_hash": agent.states_hash}
-    sources = [one["provenance"] for one in parts.values()]
-    return bool(sources) and all(
-        source["config"] == config and agent.items() <= source.get("agent", {}).items()
-        for source in sources
+def _difference(there: dict, here: dict) -> str:
+    """The entries in which two dictionaries differ; "" if they do not."""
+    keys = [key for key in here | there if there.get(key) != here.get(key)]
+    return ", ".join(
+        f"{key} is {shown(there.get(key))} there and {shown(here.get(key))} here" for key in keys
     )
 
 
-def _read_parts(path: Path, fix: str) -> dict:
+def _other_settings(part: dict, settings: dict | None) -> str:
+    """How a stored part's own settings differ from these; "" if they do not, or none are given."""
+    if settings is None:
+        return ""
+    return _difference(part["provenance"].get("settings") or {}, _as_json("settings", settings))
+
+
+class _Source(TypedDict):
+    """What the provenance of a part has to say; it says more."""
+
+    __pydantic_config__ = pydantic.ConfigDict(extra="allow", strict=True)
+    config: dict
+    seconds: float
+    agent: NotRequired[dict]
+    settings: NotRequired[dict]
+
+
+class _Part(TypedDict):
+    __pydantic_config__ = pydantic.ConfigDict(extra="allow", strict=True)
+    records: list[dict]
+    provenance: _Source
+
+
+class _Document(TypedDict):
+    __pydantic_config__ = pydantic.ConfigDict(extra="allow", strict=True)
+    parts: dict[str, _Part]
+
+
+_DOCUMENT = pydantic.TypeAdapter(_Document)
+
+
+def _read(path: Path, fix: str) -> dict[str, dict]:
     """The parts in a result's file: {name: {"records": [...], "provenance": {...}}}.
 
-    Raises FileNotFoundError if it is missing, ValueError if it is damaged.
+    Raises FileNotFoundError if it does not exist, ValueError if it is damaged.
     """
-
-    def require(sound: bool, what: str, value, expected: str):
-        if not sound:
-            raise ValueError(f"{what} is {shown(value)}, expected {expected}")
-
-    def listed(value, kind):
-        return isinstance(value, list) and all(isinstance(x, kind) for x in value)
-
     # Records may hold NaN, where a number does not exist.
     document = read_json(path, fix, finite=False)
     try:
-        parts = document.get("parts") if isinstance(document, dict) else document
-        require(isinstance(parts, dict), "'parts'", parts, "an object")
-        for name, part in parts.items():
-            require(isinstance(part, dict), name, part, "an object")
-            require(listed(part.get("records"), dict), "records", part.get("records"), "objects")
-            source = part.get("provenance")
-            require(isinstance(source, dict), "provenance", source, "an object")
-            for key, kind, words in (
-                ("config", dict, "an object"),
-                ("seconds", float, "a number"),
-                ("agent", dict, "an object"),
-            ):
-                value = source.get(key, {} if key == "agent" else None)
-                require(isinstance(value, kind), key, value, words)
-            own = source.get("agent", {}).values()
-            require(not any(isinstance(x, list | dict) for x in own), "agent", source, "texts")
-    except ValueError as error:
-        raise ValueError(f"{path} is damaged ({error}); {fix}") from error
-    return parts
-
-
-def _fits(part: dict, settings: dict | None) -> bool:
-    """Whether a stored part has these settings of its own; None asks for none."""
-    return settings is None or part["provenance"].get("settings") == json.loads(
-        json.dumps(settings)
-    )
+        return _DOCUMENT.validate_python(document)["parts"]
+    except pydantic.ValidationError as error:
+        first = error.errors(include_url=False)[0]
+        place = ".".join(map(str, first["loc"])) or "the document"
+        raise ValueError(f"{path} is damaged ({place}: {first['msg']}); {fix}") from error
 
 
 def _one_record_per_line(parts: dict) -> str:
@@ -318,3 +327,24 @@ def _one_record_per_line(parts: dict) -> str:
             f' {json.dumps(name)}: {{\n  "provenance": {source},\n  "records": [\n{records}\n  ]}}'
         )
     return '{"parts": {\n' + ",\n".join(texts) + "\n}}\n"
+
+
+def _require_parts(name: str, parts) -> dict:
+    """The dictionary; TypeError unless it is one whose keys are names of parts."""
+    require_kind(name, parts, dict, "by name of the part")
+    for part in parts:
+        require_kind(f"a key of {name}", part, str, "the name of a part")
+    if name == "parts" and not parts:
+        raise ValueError("parts is {}; expected at least one part")
+    return parts
+
+
+def _as_json(name: str, value):
+    """The value as it comes back from JSON; ValueError if JSON cannot hold it."""
+    try:
+        return json.loads(json.dumps(value))
+    except (TypeError, ValueError) as error:
+        raise ValueError(
+            f"{name} is {shown(value)}, which JSON cannot hold ({error}); expected numbers, texts, "
+            "lists and dictionaries"
+        ) from error

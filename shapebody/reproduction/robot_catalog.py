@@ -20,7 +20,7 @@ TOPPLED_HEIGHT = 0.5
 
 def robot_table(names: Sequence[str] | None = None) -> list[dict]:
     """One record per robot, in alphabetical order: what the paper's table of robots prints
-    (Appendix A) and what a reader wants to know beside it.
+    (Appendix A) and what a reader wants to know besides.
 
     Args:
         names: robots, all shipped ones if not given.
@@ -78,7 +78,7 @@ def random_bodies(robot: Robot, designs: int = 200, control_steps: int = 50, see
         share of designs whose simulation became invalid (non_finite_*, see `NativePhysics`) and
         of the others that ended more than TOPPLED_TILT degrees from upright or below
         TOPPLED_HEIGHT of their starting height (toppled_*); crossed_limits, the share with at
-        least one joint whose limits have crossed (`mjcf.ordered_ranges`).
+        least one joint whose limits have crossed (`design.export.ordered_ranges`).
     """
     space = DesignSpace(robot)
     require_integer("designs", designs, 1, 100_000)

@@ -15,7 +15,7 @@ class Budget:
     episodes: int
     """Evaluation episodes per design, where a notebook evaluates some."""
     study_episodes: int
-    """Evaluation episodes per design of the stored design studies (`studies`)."""
+    """Evaluation episodes per design of the stored design studies (`design_study`)."""
     search_iterations: int | None
     """Iterations of their searches; None for the paper's."""
     random_designs: int
@@ -37,7 +37,7 @@ BUDGETS = {
     "reduced": Budget(10, 50, 50, None, 256, 8, 400_000, 6.0, 12, 1000),
     "full": Budget(10, 200, 200, None, 256, 32, 20_000_000, 10.0, 12, 1000),
 }
-"""Budgets by scale. What training changes beside sizes is in `scales_table`."""
+"""Budgets by scale. What differs in training besides sizes is in `scales_table`."""
 
 
 def scale() -> str:
@@ -52,7 +52,7 @@ def budget() -> Budget:
 
 
 def study_setting() -> dict:
-    """What `studies.design_study` takes from the budget of the scale in force."""
+    """What `design_study` takes from the budget of the scale in force."""
     one = budget()
     return dict(
         starts=one.starts,

@@ -12,7 +12,7 @@ from shapebody.files import data_dir
 from shapebody.networks.published import load_published_policy
 from shapebody.optimizers.objective import Objective
 from shapebody.optimizers.search import METHODS, search
-from shapebody.reproduction.design_study import _evaluation, _require_counts
+from shapebody.reproduction.design_study import evaluation_config, require_counts
 from shapebody.reproduction.results import result, result_path, stored_result
 from shapebody.robot.robot import require_robot
 
@@ -32,13 +32,13 @@ def value_against_return(
         One record per design: its number, predicted value and mean return.
     """
     require_agent(agent)
-    _require_counts(designs=designs, episodes=episodes, horizon=horizon)
+    require_counts(designs=designs, episodes=episodes, horizon=horizon)
     require_seed("seed", seed)
     require_flag("progress", progress)
     space = DesignSpace(robot)
     f = np.stack([space.start(seed + i) for i in range(designs)])
     predicted = np.asarray(Objective.of(agent, robot, 0.0).value(f))
-    config = _evaluation(episodes, horizon)
+    config = evaluation_config(episodes, horizon)
     score = evaluate(agent, robot, f, seed=seed, config=config, progress=progress)
     return [
         {
@@ -63,18 +63,19 @@ def size_share(
 
     Three entries of f scale the whole body along its axes. Every found design is taken apart into
     these (all other entries at the reference) and the rest (these at the reference), like the
-    paper's counterfactuals (Section 4.3), which put groups into the start design instead.
+    counterfactuals of the paper (Section 4.3), which put groups into the start design instead.
 
     Returns:
         One record per body: kept ("reference", "all", "size only", "all but size"), start number
         (None for the reference), predicted value, and the returns of all episodes.
     """
     require_agent(agent)
-    _require_counts(starts=starts, episodes=episodes, horizon=horizon)
+    require_counts(starts=starts, episodes=episodes, horizon=horizon)
     require_seed("seed", seed)
     space = DesignSpace(robot)
     short = {} if iterations is None else {"iterations": iterations}
     METHODS["vgds"].config(**short)  # refuses wrong iterations
+    # The designs that are found, whole and in two parts.
     initial = np.stack([space.start(i) for i in range(starts)])
     found = search("vgds", agent, robot, initial, trust_region=100.0, seed=seed, **short).design
     size = np.zeros(space.dim, bool)
@@ -85,9 +86,10 @@ def size_share(
         "size only": np.where(size, found, 0.0),
         "all but size": np.where(size, 0.0, found),
     }
+    # What all of them are worth.
     designs = np.concatenate(list(bodies.values())).astype(np.float32)
     predicted = Objective.of(agent, robot, 0.0).value(designs)
-    score = evaluate(agent, robot, designs, seed=seed, config=_evaluation(episodes, horizon))
+    score = evaluate(agent, robot, designs, seed=seed, config=evaluation_config(episodes, horizon))
     names = [(kept, i) for kept, rows in bodies.items() for i in range(len(rows))]
     return [
         {
@@ -108,9 +110,9 @@ def published_policy(robot, agent, folder=None, starts: int = 10, episodes: int 
 
     Args:
         robot: the robot of that policy.
-        agent: any agent for it; only its policy is replaced.
-        folder: with the authors' files (`load_published_policy`). Without it the stored result
-            is returned.
+        agent: any agent for it; its policy is replaced by the authors'.
+        folder: with the authors' files (`load_published_policy`). If it is not given, the stored
+            result is returned.
         starts, episodes: start designs, and evaluation episodes per design.
 
     Returns:
@@ -122,15 +124,15 @@ def published_policy(robot, agent, folder=None, starts: int = 10, episodes: int 
     """
     require_robot(robot)
     require_agent(agent)
-    _require_counts(starts=starts, episodes=episodes)
+    require_counts(starts=starts, episodes=episodes)
     name = f"published_policy_{robot.name}"
     if folder is None:
-        # Theirs is the same policy at all scales.
+        # The authors' policy is the same at all scales.
         for path in (result_path(name), data_dir() / "results" / f"{name}.json"):
             if path.exists():
                 return stored_result(path)
         raise FileNotFoundError(
-            f"{path.name} is not in data/results; give the folder of the authors' weights"
+            f"{path.name} does not exist in data/results; give the folder of the authors' weights"
         )
 
     def compute():
