@@ -71,13 +71,18 @@ INTERNAL = {
     "robot.standing": "simulates robots that `robot.report` has loaded",
     "robot.survey": "looks at the text of files, for `robot.guard`",
     "robot.urdf": "looks at the text of files, for `robot.importing`",
+    "rotations": "formulas inside compiled code",
     "show.software_renderer": "draws models that `show.render` has looked at",
     "stored": "reads files whose paths others have looked at",
+    "task.batch": "environments of `task.env`, which has looked at the arguments",
     "task.curriculum": "formulas inside compiled code, called by `task.env`",
     "task.episode": "one episode inside compiled code, called by `task.env`",
+    "task.mjx_rollout": "loops of `task.env`, which has looked at the arguments",
+    "task.native_rollout": "loops of `task.env`, which has looked at the arguments",
     "task.observations": "formulas inside compiled code, called by `task.env`",
     "task.randomization": "formulas inside compiled code, called by `task.env`",
     "task.sensors": "formulas inside compiled code, called by `task.env`",
+    "task.trajectory": "what `task.env` returns",
 }
 
 RESULT = "a result: the package makes it, no user does"
@@ -88,14 +93,17 @@ ON_MODEL = "one of the checks of a compiled model, called by `robot.robot.examin
 UNCHECKED = {
     "agent.agent.Agent": "looked at by `check_agent`, which saving and loading call",
     "design.descriptions.Descriptions": RESULT,
+    "design.descriptions.Normalizer": "a row of NORMALIZERS",
+    "design.descriptions.Normalizer.__call__": FORMULA,
     "design.kinematics.Frames": RESULT,
+    "design.kinematics.body_kinematics": "called by `describe` and `kinematics`",
+    "design.kinematics.take_columns": FORMULA,
     "design.phi.Embodiment": RESULT,
-    "rotations.quaternion_product": FORMULA,
+    "design.phi.Reference": "made by `reference_of`",
+    "design.phi.reference_of": "called by `DesignSpace` with a robot",
     "evaluation.evaluate.Evaluation": RESULT,
     "evaluation.statistics.Gain": RESULT,
     "reproduction.scale.Budget": "a row of BUDGETS",
-    "task.env.StepRecord": RESULT,
-    "task.env.Trajectory": RESULT,
     "task.rewards.Moment": RESULT,
     "task.rewards.Term": "a row of TERMS",
     "task.rewards.reward_terms": FORMULA,
@@ -114,6 +122,7 @@ UNCHECKED = {
     "networks.policy.log_prob": FORMULA,
     "networks.inputs.require_inputs": "a check itself, called by `Agent.act` and `Agent.values`",
     "physics.protocol.Readings": RESULT,
+    "physics.engine.simulator": "called by `Locomotion`, which has looked at the engine's name",
     "physics.protocol.home_sensordata": "called by the engines with the model of `prepare`",
     "physics.mjx.PhysicsState": RESULT,
     "training.update.Learner": RESULT,
@@ -142,7 +151,6 @@ UNCHECKED = {
     "notebooks.main": "the command line, see the other test",
 }
 UNCHECKED |= {
-    "design.phi.phi": FORMULA,
     "optimizers.loop.initial_population": METHOD,
     "training.config.as_robots": "a check itself, called by `TrainConfig`",
     "training.config.located": "takes a robot of a `TrainConfig`",
@@ -183,11 +191,13 @@ UNCHECKED |= dict.fromkeys(
     (
         f"task.rewards.{name}"
         for name in (
-            "action_rate action_smoothness alive base_height foot_air_time foot_slip "
-            "foot_z_velocity imu_acceleration joint_acceleration joint_nominal_deviation "
-            "joint_position_limit joint_torque joint_velocity joint_velocity_limit positive_power "
-            "roll_pitch_position roll_pitch_velocity self_collision symmetric_air "
-            "xy_velocity_tracking yaw_velocity_tracking z_velocity"
+            "t1_xy_velocity_tracking t2_yaw_velocity_tracking t3_alive_clipped "
+            "t4_alive_unclipped t5_z_velocity t6_imu_acceleration t7_roll_pitch_velocity "
+            "t8_roll_pitch_position t9_joint_nominal_deviation t10_joint_position_limit "
+            "t11_joint_velocity_limit t12_joint_velocity t13_joint_acceleration "
+            "t14_joint_torque t15_positive_power t16_action_rate t17_action_smoothness "
+            "t18_self_collision t19_base_height t20_foot_air_time t21_symmetric_air "
+            "t22_foot_slip t23_foot_z_velocity"
         ).split()
     ),
     FORMULA,
@@ -333,8 +343,9 @@ FUNCTIONS = {
     "design.space.DesignSpace.to_mjcf": dict(f=DESIGN),
     "design.space.DesignSpace.to_model": dict(f=DESIGN),
     "design.space.DesignSpace.validate": dict(f=DESIGN),
-    "design.phi.published_axes": dict(robot=ROBOT, f=DESIGN),
-    "design.phi.published_axes_seed": dict(
+    "design.phi.phi": dict(reference=thing(lambda world: world.space.reference_robot), f=DESIGN),
+    "design.axes.published_axes": dict(robot=ROBOT, f=DESIGN),
+    "design.axes.published_axes_seed": dict(
         f=DESIGN.also(
             "list",
             "array",
@@ -347,7 +358,7 @@ FUNCTIONS = {
             why="any numbers have a sum",
         )
     ),
-    "design.phi.rotation_axes": dict(
+    "design.axes.rotation_axes": dict(
         generator=thing(lambda world: np.random.default_rng(0)),
         joint_axes=array(2, 3, right=np.eye(3)),
         num_bodies=integer(1, 10**6),
@@ -359,7 +370,6 @@ FUNCTIONS = {
         coefficient=PROBABILITY,
         task=TASK,
         num_envs=integer(1, 10**6),
-        recompute_constants=FLAG,
     ),
     "evaluation.statistics.bootstrap_interval": dict(
         values=array(3, accepts=("array", "JAX array")),
@@ -420,14 +430,6 @@ FUNCTIONS = {
         trust_region=TRUST_REGION,
     ),
     "reproduction.scale.budget": {},
-    "reproduction.derived_constants.derived_constants": dict(
-        agent=AGENT,
-        robot=ROBOT,
-        starts=integer(0, 10**5),
-        episodes=integer(2, 10**6),
-        seed=SEED,
-        horizon=integer(1, 10**400),
-    ),
     "reproduction.results.result_provenance": dict(agent=optional(AGENT), seconds=SECONDS),
     "evaluation.statistics.rank_correlation": dict(
         x=array(4, right=[1.0, 2.0, 3.0]),
@@ -616,10 +618,10 @@ FUNCTIONS = {
         solver_iterations=optional(integer(1, 10**4)),
         line_search=optional(integer(1, 10**4)),
     ),
+    "physics.engine.resolved": dict(engine=ENGINE),
     "physics.mjx.MjxPhysics": dict(
         robot=ROBOT,
         num_envs=integer(1, 2**20),
-        impl=choice("jax"),
         substeps=integer(1, 10**4),
         solver_iterations=integer(1, 10**4).also("None", why="the model's number"),
         line_search=integer(1, 10**4).also("None", why="the model's number"),
@@ -649,7 +651,6 @@ FUNCTIONS = {
         substeps=integer(1, 10**4),
         solver_iterations=optional(integer(1, 10**4)),
         line_search=optional(integer(1, 10**4)),
-        recompute_constants=FLAG,
     ),
     "physics.native.NativePhysics.get_model": dict(env=integer(0, 1, 0)),
     "physics.native.NativePhysics.restore": dict(state=thing(lambda world: world.physics.state())),

@@ -351,7 +351,7 @@ def _(world):
     from shapebody.evaluation.evaluate import Evaluation
 
     rows = np.zeros((2, 3), np.float32)
-    names = ("robot", "engine", "seed", "coefficient", "task", "recompute_constants")
+    names = ("robot", "engine", "seed", "coefficient", "task")
     return Evaluation(rows, rows, rows, rows == 0, 1.0, dict.fromkeys(names))
 
 

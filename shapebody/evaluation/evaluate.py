@@ -19,14 +19,15 @@ from shapebody.arguments import (
     require_kind,
     require_seed,
 )
-from shapebody.configuration import Flag, configuration, integer, number
+from shapebody.configuration import configuration, integer, number
 from shapebody.design.space import DesignSpace
 from shapebody.evaluation.statistics import CONFIDENCE, MOST_EPISODES, _out, bootstrap_interval
 from shapebody.networks.config import PolicyConfig
 from shapebody.networks.policy import Policy
 from shapebody.robot.robot import Robot
+from shapebody.task.batch import RESET_SLOTS
 from shapebody.task.config import TaskConfig
-from shapebody.task.env import RESET_SLOTS, Locomotion
+from shapebody.task.env import Locomotion
 
 _CALLS = 50  # control steps between reports, and per call of an engine that runs whole rollouts
 
@@ -47,9 +48,6 @@ class EvaluationConfig:
     """Settings of the task."""
     num_envs: Episodes = 512
     """Largest number of episodes that run side by side."""
-    recompute_constants: Flag = False
-    """Native engine: recompute MuJoCo's derived constants for every design, instead of keeping
-    the reference's as the paper's environment does."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -166,7 +164,7 @@ def evaluate(
     total = len(rows) * config.episodes
     chunks = -(-total // config.num_envs)
     size = -(-total // chunks)
-    env = _environment(robot, size, engine, config.task, config.recompute_constants)
+    env = _environment(robot, size, engine, config.task)
     keys = np.asarray(_episode_keys(seed, config.episodes))
     work = _Work(rows, keys, config, progress)
     began = time.perf_counter()
@@ -340,21 +338,8 @@ def _embed(config: PolicyConfig):
 
 
 @functools.lru_cache(maxsize=4)
-def _environment(
-    robot: Robot,
-    num_envs: int,
-    engine: str,
-    task: TaskConfig,
-    recompute_constants: Flag = False,
-) -> Locomotion:
-    options = {"recompute_constants": True} if recompute_constants else None
-    native = engine == "native" or (engine == "auto" and jax.default_backend() == "cpu")
-    if recompute_constants and not native:
-        raise ValueError(
-            "recompute_constants is True, which only the native engine can do; pass "
-            "engine='native', or leave it False"
-        )
-    return Locomotion(robot, num_envs, engine, task, auto_reset=False, physics_options=options)
+def _environment(robot: Robot, num_envs: int, engine: str, task: TaskConfig) -> Locomotion:
+    return Locomotion(robot, num_envs, engine, task, auto_reset=False)
 
 
 @functools.partial(jax.jit, static_argnums=1)

@@ -96,7 +96,7 @@ def paired_gain(
         ValueError: if the shapes differ, or the two evaluations had other seeds or settings.
     """
     if hasattr(after, "returns") and hasattr(before, "returns"):
-        for name in ("robot", "engine", "seed", "coefficient", "task", "recompute_constants"):
+        for name in ("robot", "engine", "seed", "coefficient", "task"):
             if after.settings[name] != before.settings[name]:
                 raise ValueError(
                     f"the evaluations differ in {name}: {after.settings[name]!r} and "
