@@ -73,13 +73,18 @@ INTERNAL = {
     "robot.survey": "looks at the text of files, for `robot.guard`",
     "robot.urdf": "imports files that `find` has found, for `robot.importing`",
     "robot.urdf_checks": "looks at the text of files, for `robot.urdf`",
+    "rotations": "formulas inside compiled code",
     "show.software_renderer": "draws models that `show.render` has looked at",
     "stored": "reads files whose paths others have looked at",
+    "task.batch": "environments of `task.env`, which has looked at the arguments",
     "task.curriculum": "formulas inside compiled code, called by `task.env`",
     "task.episode": "one episode inside compiled code, called by `task.env`",
+    "task.mjx_rollout": "loops of `task.env`, which has looked at the arguments",
+    "task.native_rollout": "loops of `task.env`, which has looked at the arguments",
     "task.observations": "formulas inside compiled code, called by `task.env`",
     "task.randomization": "formulas inside compiled code, called by `task.env`",
     "task.sensors": "formulas inside compiled code, called by `task.env`",
+    "task.trajectory": "what `task.env` returns",
 }
 
 RESULT = "a result: the package makes it, no user does"
@@ -90,9 +95,14 @@ ON_MODEL = "one of the checks of a compiled model, called by `robot.robot.examin
 UNCHECKED = {
     "agent.agent.Agent": "looked at by `check_agent`, which saving and loading call",
     "design.descriptions.Descriptions": RESULT,
+    "design.descriptions.Normalizer": "a row of NORMALIZERS",
+    "design.descriptions.Normalizer.__call__": FORMULA,
     "design.kinematics.Frames": RESULT,
+    "design.kinematics.body_kinematics": "called by `describe` and `kinematics`",
+    "design.kinematics.take_columns": FORMULA,
     "design.phi.Embodiment": RESULT,
-    "rotations.quaternion_product": FORMULA,
+    "design.phi.Reference": "made by `reference_of`",
+    "design.phi.reference_of": "called by `DesignSpace` with a robot",
     "evaluation.evaluate.Evaluation": RESULT,
     "evaluation.statistics.Gain": RESULT,
     "evaluation.statistics.float_or_array": "takes what was computed here",
@@ -102,8 +112,6 @@ UNCHECKED = {
     "reproduction.design_study.search_settings": "takes runs that `design_study` has looked at",
     "design.space.DesignSpace.as_float32": "a check itself, called by `Objective` and `validate`",
     "reproduction.scale.Budget": "a row of BUDGETS",
-    "task.env.StepRecord": RESULT,
-    "task.env.Trajectory": RESULT,
     "task.rewards.Moment": RESULT,
     "task.rewards.Term": "a row of TERMS",
     "task.rewards.reward_terms": FORMULA,
@@ -125,6 +133,7 @@ UNCHECKED = {
     "networks.policy.log_prob": FORMULA,
     "networks.inputs.require_inputs": "a check itself, called by `Agent.act` and `Agent.values`",
     "physics.protocol.Readings": RESULT,
+    "physics.engine.simulator": "called by `Locomotion`, which has looked at the engine's name",
     "physics.protocol.home_sensordata": "called by the engines with the model of `prepare`",
     "physics.mjx.PhysicsState": RESULT,
     "training.update.Learner": RESULT,
@@ -152,7 +161,6 @@ UNCHECKED = {
     "notebooks.main": "the command line, see the other test",
 }
 UNCHECKED |= {
-    "design.phi.phi": FORMULA,
     "optimizers.loop.initial_population": METHOD,
     "training.config.as_robots": "a check itself, called by `TrainConfig`",
     "training.config.located": "takes a robot of a `TrainConfig`",
@@ -193,11 +201,13 @@ UNCHECKED |= dict.fromkeys(
     (
         f"task.rewards.{name}"
         for name in (
-            "action_rate action_smoothness alive base_height foot_air_time foot_slip "
-            "foot_z_velocity imu_acceleration joint_acceleration joint_nominal_deviation "
-            "joint_position_limit joint_torque joint_velocity joint_velocity_limit positive_power "
-            "roll_pitch_position roll_pitch_velocity self_collision symmetric_air "
-            "xy_velocity_tracking yaw_velocity_tracking z_velocity"
+            "t1_xy_velocity_tracking t2_yaw_velocity_tracking t3_alive_clipped "
+            "t4_alive_unclipped t5_z_velocity t6_imu_acceleration t7_roll_pitch_velocity "
+            "t8_roll_pitch_position t9_joint_nominal_deviation t10_joint_position_limit "
+            "t11_joint_velocity_limit t12_joint_velocity t13_joint_acceleration "
+            "t14_joint_torque t15_positive_power t16_action_rate t17_action_smoothness "
+            "t18_self_collision t19_base_height t20_foot_air_time t21_symmetric_air "
+            "t22_foot_slip t23_foot_z_velocity"
         ).split()
     ),
     FORMULA,
@@ -343,8 +353,9 @@ FUNCTIONS = {
     "design.space.DesignSpace.to_mjcf": dict(f=DESIGN),
     "design.space.DesignSpace.to_model": dict(f=DESIGN),
     "design.space.DesignSpace.validate": dict(f=DESIGN),
-    "design.phi.published_axes": dict(robot=ROBOT, f=DESIGN),
-    "design.phi.published_axes_seed": dict(
+    "design.phi.phi": dict(reference=thing(lambda world: world.space.reference_robot), f=DESIGN),
+    "design.axes.published_axes": dict(robot=ROBOT, f=DESIGN),
+    "design.axes.published_axes_seed": dict(
         f=DESIGN.also(
             "list",
             "array",
@@ -357,7 +368,7 @@ FUNCTIONS = {
             why="any numbers have a sum",
         )
     ),
-    "design.phi.rotation_axes": dict(
+    "design.axes.rotation_axes": dict(
         generator=thing(lambda world: np.random.default_rng(0)),
         joint_axes=array(2, 3, right=np.eye(3)),
         num_bodies=integer(1, 10**6),
@@ -620,10 +631,10 @@ FUNCTIONS = {
         solver_iterations=optional(integer(1, 10**4)),
         line_search=optional(integer(1, 10**4)),
     ),
+    "physics.engine.resolved": dict(engine=ENGINE),
     "physics.mjx.MjxPhysics": dict(
         robot=ROBOT,
         num_envs=integer(1, 2**20),
-        impl=choice("jax"),
         substeps=integer(1, 10**4),
         solver_iterations=integer(1, 10**4).also("None", why="the model's number"),
         line_search=integer(1, 10**4).also("None", why="the model's number"),
@@ -653,7 +664,6 @@ FUNCTIONS = {
         substeps=integer(1, 10**4),
         solver_iterations=optional(integer(1, 10**4)),
         line_search=optional(integer(1, 10**4)),
-        recompute_constants=FLAG,
     ),
     "physics.native.NativePhysics.get_model": dict(env=integer(0, 1, 0)),
     "physics.native.NativePhysics.restore": dict(state=thing(lambda world: world.physics.state())),

@@ -11,9 +11,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
+from shapebody.design.axes import published_axes, published_axes_seed
 from shapebody.design.export import TIGHT_RANGE, balanced, ordered_ranges
 from shapebody.design.parameters import BLOCKS, KINDS, part_label
-from shapebody.design.phi import MODEL_FIELDS, Embodiment, published_axes, published_axes_seed
+from shapebody.design.phi import MODEL_FIELDS, Embodiment, phi
 from shapebody.design.space import DesignSpace
 from shapebody.robot.robot import load_robot
 
@@ -256,6 +257,18 @@ def test_start_designs(go2):
     expected = np.random.default_rng(3).uniform(-1, 1, 358).astype(np.float32)
     np.testing.assert_array_equal(go2.start(3), expected)
     assert go2.start(3).dtype == np.float32
+
+
+def test_phi_is_a_function_of_a_reference_robot_and_a_design(go2):
+    """As the space calls it, and with the reference as an argument of compiled code."""
+    f = go2.start(1)
+    for name, value in dataclasses.asdict(jax.jit(phi)(go2.reference_robot, f)).items():
+        np.testing.assert_allclose(value, getattr(go2(f), name), rtol=1e-5, atol=1e-7)
+    assert go2.reference_robot.slices == go2.slices
+    with pytest.raises(ValueError, match=r"f has shape \(357,\); expected \[358\]"):
+        phi(go2.reference_robot, f[1:])
+    with pytest.raises(TypeError, match=r"reference is .*; expected a Reference: DesignSpace"):
+        phi(go2.robot, f)
 
 
 def test_axes_are_constants_of_the_space(go2):

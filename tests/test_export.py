@@ -129,13 +129,15 @@ def plain(text: str, seconds: float = SECONDS, lift: float = 0.0):
     return model, np.array(positions)
 
 
-def ours(robot, embodiment=None, home=None, seconds=SECONDS, lift=0.0, **options):
+def ours(robot, embodiment=None, home=None, seconds=SECONDS, lift=0.0, recompute=False):
     """The same of our environment's physics, for the robot itself or one of its designs."""
-    physics = NativePhysics(robot, 1, threads=1, substeps=SUBSTEPS, **options)
+    physics = NativePhysics(robot, 1, threads=1, substeps=SUBSTEPS)
     home, targets = (robot.home if home is None else home).copy(), robot.nominal
     if embodiment is not None:
         targets = np.asarray(embodiment.nominal, np.float64)
         physics.set_designs(np.arange(1), jax.tree.map(lambda x: np.asarray(x)[None], embodiment))
+    if recompute:  # the constants that compiling a file derives from the design
+        physics._batch.set_const(np.arange(1))
     home[2] += lift
     physics.set_state(np.arange(1), home, np.zeros(robot.model.nv))
     positions = []
@@ -289,8 +291,7 @@ def test_designs(designs):
         model, positions = plain(text, lift=0.002)
         assert_complete(model, robot)
         home = model.key("home").qpos
-        options = dict(lift=0.002, recompute_constants=True)
-        expected = ours(robot, as_written(robot, body), home, **options)
+        expected = ours(robot, as_written(robot, body), home, lift=0.002, recompute=True)
         np.testing.assert_allclose(positions[0], expected[0], rtol=0, atol=1e-7)
         until = len(positions) if index % 2 == 0 else 10  # the near ones do not tumble
         np.testing.assert_allclose(positions[:until], expected[:until], rtol=0, atol=1e-4)

@@ -133,6 +133,12 @@ def test_reward_terms_by_hand(env):
     assert term(11, m) == pytest.approx(-0.1 * np.mean(m.descriptions.velocity_limits), rel=1e-4)
 
 
+def test_terms_have_the_numbers_of_the_paper():
+    for number, term in enumerate(TERMS, 1):
+        assert term.number == number and term.function.__name__.startswith(f"t{number}_")
+        assert term.function.__doc__.startswith(f"T{number}: ")
+
+
 def test_standing_command_wants_no_air_time(env):
     m = moment_of(env.reset(jax.random.PRNGKey(0), designs=np.zeros(358)))
     m = m._replace(command=np.zeros(3), contact=np.ones(4), air_time=np.zeros(4))
@@ -273,7 +279,7 @@ def test_nominal_start_at_zero_coefficient(env, go2):
         np.asarray(state.readings.foot_position)[..., 2].min(1), 0, atol=1e-6
     )
     np.testing.assert_allclose(state.readings.imu_height, state.descriptions.imu_height, atol=1e-6)
-    _, observation = env._observe_jit(state)
+    _, observation = env.batch.observe(state)
     assert np.abs(observation.joints[..., :3]).max() < 1e-6
     np.testing.assert_allclose(observation.general[:, 10:], [[0, 0, -1]] * 6, atol=1e-6)
     np.testing.assert_allclose(observation.privileged[:, 4], 0)

@@ -1,5 +1,4 @@
 import dataclasses
-import importlib.util
 
 import jax
 import jax.numpy as jnp
@@ -125,8 +124,8 @@ def test_native_is_a_compiled_model(robot, space, controls):
     """
     f = (0.02 * space.start(2)).astype(np.float32)
     model = mujoco.MjModel.from_xml_string(space.to_mjcf(f))
-    physics = NativePhysics(robot, 1, recompute_constants=True)
-    start(physics, jax.device_get(jax.vmap(space)(f[None])))
+    physics = start(NativePhysics(robot, 1), jax.device_get(jax.vmap(space)(f[None])))
+    physics._batch.set_const(np.array([0]))
     data = mujoco.MjData(model)
     data.qpos[:] = robot.home
     for ctrl in controls[:10, :1]:
@@ -368,7 +367,7 @@ def test_mjx_failure_is_contained(failure, mjx_physics, embodiments, controls, r
         np.testing.assert_array_equal(one[others], two[others])
 
 
-# Options.
+# Constants and options.
 
 # What MuJoCo derives from a design; of these, only the bounding radius is also given by it.
 DERIVED = {
@@ -378,13 +377,13 @@ DERIVED = {
 }  # fmt: skip
 
 
-def test_recompute_constants(robot, embodiments):
-    kept = NativePhysics(robot, N)
-    recomputed = NativePhysics(robot, N, recompute_constants=True)
-    for physics in (kept, recomputed):
-        physics.set_designs(np.array([6, 1]), jax.tree.map(lambda x: x[:2], embodiments))
+def test_derived_constants_stay_those_of_the_reference(robot, embodiments):
+    physics = NativePhysics(robot, N)
+    physics.set_designs(np.array([6, 1]), jax.tree.map(lambda x: x[:2], embodiments))
+    one = physics.get_model(6)
+    physics._batch.set_const(np.array([6]))
+    two = physics.get_model(6)
     different = set()
-    one, two = kept.get_model(6), recomputed.get_model(6)
     for name in dir(one):
         value = getattr(one, name) if not name.startswith("_") else None
         if isinstance(value, np.ndarray) and not np.array_equal(value, getattr(two, name)):
@@ -452,14 +451,13 @@ def test_native_errors(native, embodiments, call, message):
 def test_constructor_errors(robot):
     from shapebody.physics.mjx import MjxPhysics
 
-    for options in ({"num_envs": 0}, {"substeps": 0}, {"threads": -1}, {"line_search": 1.5}):
+    with pytest.raises(ValueError, match="threads"):
+        NativePhysics(robot, 1, threads=-1)
+    for options in ({"num_envs": 0}, {"substeps": 0}, {"line_search": 1.5}):
         with pytest.raises(ValueError, match=next(iter(options))):
             NativePhysics(robot, **({"num_envs": 1} | options))
-    with pytest.raises(ValueError, match="impl is 'cpp'; expected one of jax, warp"):
-        MjxPhysics(robot, 1, impl="cpp")
-    if importlib.util.find_spec("warp") is None:
-        with pytest.raises(RuntimeError, match="use impl='jax'"):
-            MjxPhysics(robot, 1, impl="warp")
+        with pytest.raises(ValueError, match=next(iter(options))):
+            MjxPhysics(robot, **({"num_envs": 1} | options))
 
 
 def test_mjx_errors(mjx_physics, embodiments, robot):

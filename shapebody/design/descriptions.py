@@ -1,14 +1,16 @@
 """Static descriptions of an embodiment: what the networks are told about joints, feet and body.
 
-Pure JAX: forward kinematics of one design at its nominal pose, then the normalized description
-vectors of Appendix A. All that depends on the design is differentiable and needs no physics engine;
-MuJoCo's kinematics are asked once per robot, for which foot mirrors which.
+Pure JAX: forward kinematics of one design at its nominal pose, then the description vectors of
+Appendix A, brought to the order of 1 by `NORMALIZERS`. All that depends on the design is
+differentiable and needs no physics engine; MuJoCo's kinematics are asked once per robot, for which
+foot mirrors which.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -17,19 +19,60 @@ import numpy as np
 
 from shapebody.arguments import require_kind
 from shapebody.configuration import configuration, integer
-from shapebody.design.kinematics import _constant_rotations, _matrix, _rotate, _take, _tree
+from shapebody.design.kinematics import body_kinematics, take_columns
 from shapebody.design.parameters import soft_limits
 from shapebody.design.phi import Embodiment
 from shapebody.robot.robot import Robot, require_robot
+from shapebody.rotations import constant_matrices, rotate, rotation_matrices
 
 JOINT_DESCRIPTION = 30
 
 FOOT_DESCRIPTION = 21
 
-FOOT_SIZE_SCALE = 0.15  # m
-
 MOST_PARTS = 10_000
 """Joints, feet or spheres of a robot."""
+
+
+class Normalizer(NamedTuple):
+    """How a quantity becomes an entry of a description: value / scale - offset.
+
+    With an offset of 1, values from 0 to 2 x scale become -1 to 1; nothing is clipped.
+    """
+
+    scale: float
+    offset: float
+    unit: str
+    what: str
+
+    def __call__(self, value):
+        normalized = value / self.scale
+        return normalized - self.offset if self.offset else normalized
+
+
+NORMALIZERS = {
+    "mass": Normalizer(200.0, 1.0, "kg", "mass of one body"),
+    "inertia": Normalizer(13.0, 1.0, "kg m²", "principal inertias of one body, turned as a vector"),
+    "children": Normalizer(2.5, 1.0, "", "number of bodies that hang at the joint's body"),
+    "nominal": Normalizer(6.5, 0.0, "rad", "nominal joint position"),
+    "torque": Normalizer(800.0, 1.0, "N m", "torque limit"),
+    "velocity": Normalizer(90.0, 1.0, "rad/s", "velocity limit"),
+    "damping": Normalizer(0.1, 1.0, "N m s/rad", "damping of a joint"),
+    "armature": Normalizer(1.35, 1.0, "kg m²", "inertia of a motor, seen from its joint"),
+    "stiffness": Normalizer(0.1, 1.0, "N m/rad", "stiffness of a joint"),
+    "friction": Normalizer(18.5, 1.0, "N m", "dry friction of a joint"),
+    "range": Normalizer(6.5, 0.0, "rad", "lower and upper end of a joint's range"),
+    "p_gain": Normalizer(85.0, 1.0, "N m/rad", "P gain of all motors"),
+    "d_gain": Normalizer(1.0, 1.0, "N m s/rad", "D gain of all motors"),
+    "action_scale": Normalizer(0.75, 1.0, "rad", "change of the target by an action of 1"),
+    "total_mass": Normalizer(450.0, 1.0, "kg", "mass of the robot"),
+    "dimensions": Normalizer(1.5, 1.0, "m", "length, width and height of the bounding box"),
+    "foot_size": Normalizer(0.15, 1.0, "m", "size of a foot's geom, as in MuJoCo"),
+    "foot_type": Normalizer(0.5, 1.0, "", "0 for a sphere, 1 for a box"),
+}
+"""The paper prints no normalization. All but the last two are those of the authors' published
+policies, whose descriptions they reproduce to 1e-7; those of feet, which only the unpublished
+critics see, are chosen here. Positions are relative to the robot's bounding box instead, and axes
+are unit vectors."""
 
 
 Parts = integer(1, MOST_PARTS)
@@ -111,148 +154,57 @@ def symmetric_feet(robot: Robot) -> np.ndarray:
 def describe(robot: Robot, sizes: Sizes | None = None) -> Callable[[Embodiment], Descriptions]:
     """A function embodiment -> `Descriptions`, padded to `sizes` (default: those of the robot).
 
-    Can be jitted, vmapped and differentiated. Padding changes no other number.
-    Raises ValueError if `sizes` are smaller than the robot's.
+    It takes embodiments with any leading axes, and can be jitted, vmapped and differentiated.
+    Padding changes no other number.
+
+    Raises:
+        ValueError: if `sizes` are smaller than the robot's.
     """
-    own = Sizes.of(robot)
-    sizes = own if sizes is None else require_kind("sizes", sizes, Sizes, "Sizes.of(*robots)")
-    for name in ("joints", "feet", "spheres"):
-        if getattr(sizes, name) < getattr(own, name):
-            raise ValueError(
-                f"sizes.{name} is {getattr(sizes, name)}, expected at least "
-                f"{getattr(own, name)} for robot {robot.name!r}; use Sizes.of with all robots"
-            )
-    model = robot.model
-    forward = _tree(robot)
-    joints = robot.joints[robot.actuated]
-    dofs = robot.qvel_index
-    bodies = model.jnt_bodyid[joints]
-    children = np.bincount(model.body_parentid[1:], minlength=model.nbody)[bodies]
-    children = (children[None] / 2.5 - 1).astype(np.float32)
-    boxed = np.concatenate([robot.spheres, robot.feet])
-    home = np.asarray(robot.home, np.float32)
+    sizes = _fitting(sizes, robot)
+    at_nominal = _nominal_pose(robot)
+    # What does not depend on the design, in NumPy so that it works inside a trace.
+    joint_mask = _padded_constant(np.ones(robot.num_actuators), sizes.joints)
+    foot_mask = _padded_constant(np.ones(robot.num_feet), sizes.feet)
+    sphere_mask = _padded_constant(np.ones(robot.num_spheres), sizes.spheres)
+    keep_nominal = _padded_constant(robot.keep_nominal, sizes.joints)
+    foot_is_box = _padded_constant(robot.foot_types, sizes.feet)
+    foot_pairs = _padded_constant(symmetric_feet(robot), sizes.feet, axes=2)
     home_quat = robot.home[3:7] / np.linalg.norm(robot.home[3:7])
-    up = _constant_rotations(home_quat[None])[2, :, 0]  # vertical axis in the trunk frame
-    origin = home.copy()
-    origin[:7] = 0, 0, 0, 1, 0, 0, 0
-    # One-hot rows put nominal positions into qpos without a scatter.
-    place = np.zeros((robot.num_actuators, model.nq), np.float32)
-    place[np.arange(robot.num_actuators), robot.qpos_index] = 1
-    not_actuated = origin * (1 - place.sum(axis=0))
-    num_joints, num_feet = robot.num_actuators, robot.num_feet
-    above_diagonal = np.triu(np.ones((robot.num_spheres,) * 2, bool), k=1)
-
-    def padded(values, length, axes=1):
-        values = jnp.asarray(values, jnp.float32)
-        pad = [(0, length - values.shape[axis]) for axis in range(axes)]
-        return jnp.pad(values, pad + [(0, 0)] * (values.ndim - axes))
-
-    def constant(values, length, axes=1):
-        """`padded` for what does not depend on the design; NumPy, so that it works in a trace."""
-        values = np.asarray(values, np.float32)
-        pad = [(0, length - n) for n in values.shape[:axes]]
-        return np.pad(values, pad + [(0, 0)] * (values.ndim - axes))
-
-    joint_mask = constant(np.ones(num_joints), sizes.joints)
-    foot_mask = constant(np.ones(num_feet), sizes.feet)
-    sphere_mask = constant(np.ones(robot.num_spheres), sizes.spheres)
-    keep_nominal = constant(robot.keep_nominal, sizes.joints)
-    foot_is_box = constant(robot.foot_types, sizes.feet)
-    foot_pairs = constant(symmetric_feet(robot), sizes.feet, axes=2)
-    foot_type = (2 * robot.foot_types[None] - 1).astype(np.float32)
-    boxed_rot = _constant_rotations(model.geom_quat[boxed])
+    up = constant_matrices(home_quat[None])[2, :, 0]  # vertical axis in the trunk frame
 
     def single(embodiment: Embodiment) -> Descriptions:
         e = embodiment
-        # With the trunk at the origin, world coordinates are trunk coordinates.
-        qpos = not_actuated + jnp.sum(place * e.nominal[:, None], axis=0)
-        pos, rot, anchor, axis = forward(e, qpos)
-        com = pos + _rotate(rot, e.body_ipos.T)
-
-        # A geom reaches as far as its rotated size triple, of which a sphere has only one entry.
-        # This is not its true extent, but what descriptions are made of.
-        box_rot = _take(rot, model.geom_bodyid[boxed])
-        center = _take(pos, model.geom_bodyid[boxed]) + _rotate(box_rot, _take(e.geom_pos.T, boxed))
-        size = _take(e.geom_size.T, boxed)
-        reach = jnp.abs(_rotate(box_rot, _rotate(boxed_rot, size)))
-        anchor, axis = _take(anchor, robot.actuated), _take(axis, robot.actuated)
-        points = jnp.concatenate([anchor, com[:, 1:]], axis=-1)
-        low = jnp.min(jnp.concatenate([center - reach, points], axis=-1), axis=-1, keepdims=True)
-        high = jnp.max(jnp.concatenate([center + reach, points], axis=-1), axis=-1, keepdims=True)
-        # Without a barrier XLA computes the whole tree again for every number that uses the box.
-        low, high = jax.lax.optimization_barrier((low, high))
-        dimensions = (high - low)[:, 0]
-
-        def relative(point):
-            return 2 * (point - low) / (high - low) - 1
-
-        # Principal moments are rotated like a vector, not like a tensor.
-        moments = _rotate(rot, _rotate(_matrix(e.body_iquat.T), e.body_inertia.T)) / 13 - 1
-        attributes = jnp.concatenate([e.body_mass[None] / 200 - 1, relative(com), moments])
-        trunk = attributes[:, robot.trunk]
-
+        pose = at_nominal(e)
+        bodies = _body_rows(e, pose)
+        trunk = bodies[:, robot.trunk]
         total_mass = jnp.sum(e.body_mass[1:])
-        gains = jnp.stack([e.p_gain / 85 - 1, e.d_gain / 1 - 1, e.action_scale / 0.75 - 1])
-        whole = jnp.concatenate([gains, (total_mass / 450 - 1)[None], dimensions / 1.5 - 1])
-
-        joint_range = _take(e.jnt_range.T, joints)
-        joint_rows = jnp.concatenate(
-            [
-                relative(anchor),
-                axis,
-                _take(attributes, bodies),
-                children,
-                e.nominal[None] / 6.5,
-                e.actuator_forcerange[None, :, 1] / 800 - 1,
-                e.velocity_limits[None] / 90 - 1,
-                _take(e.dof_damping, dofs)[None] / 0.1 - 1,
-                _take(e.dof_armature, dofs)[None] / 1.35 - 1,
-                _take(e.jnt_stiffness, joints)[None] / 0.1 - 1,
-                _take(e.dof_frictionloss, dofs)[None] / 18.5 - 1,
-                joint_range / 6.5,
-                jnp.broadcast_to(whole[:, None], (7, num_joints)),
-            ]
-        )
-        spheres, feet = center[:, : robot.num_spheres], center[:, robot.num_spheres :]
-        foot_size = size[:, robot.num_spheres :]
-        foot_rows = jnp.concatenate(
-            [
-                relative(feet),
-                _take(attributes, robot.foot_bodies),
-                foot_size / FOOT_SIZE_SCALE - 1,
-                foot_type,
-                jnp.broadcast_to(whole[:, None], (7, num_feet)),
-            ]
-        )
-
+        whole = _whole(e, total_mass, pose.dimensions)
+        joint_range = take_columns(e.jnt_range.T, robot.joints[robot.actuated])
+        joints = _joint_rows(robot, e, pose, bodies, whole, joint_range)
+        feet = _foot_rows(robot, pose, bodies, whole)
         # Sums instead of products of matrices, which accelerators round to fewer digits.
-        home_height = -jnp.min(jnp.sum(up[:, None] * feet, axis=0))
+        home_height = -jnp.min(jnp.sum(up[:, None] * pose.feet, axis=0))
         imu_height = home_height + jnp.sum(up * e.site_pos[robot.imu_site])
-        radius = size[0, : robot.num_spheres]
-        distance2 = sum((row[:, None] - row[None]) ** 2 for row in spheres)
-        touching = distance2 <= (radius[:, None] + radius[None]) ** 2
-        collisions = jnp.sum(jnp.where(above_diagonal, touching, False).astype(jnp.float32))
-
         return Descriptions(
-            joints=padded(joint_rows.T, sizes.joints),
+            joints=_padded(joints.T, sizes.joints),
             joint_mask=jnp.asarray(joint_mask),
-            feet=padded(foot_rows.T, sizes.feet),
+            feet=_padded(feet.T, sizes.feet),
             foot_mask=jnp.asarray(foot_mask),
             static=jnp.concatenate([whole, trunk]),
-            nominal=padded(e.nominal, sizes.joints),
+            nominal=_padded(e.nominal, sizes.joints),
             action_scale=e.action_scale,
-            velocity_limits=padded(e.velocity_limits, sizes.joints),
-            soft_limits=padded(soft_limits(joint_range.T), sizes.joints),
+            velocity_limits=_padded(e.velocity_limits, sizes.joints),
+            soft_limits=_padded(soft_limits(joint_range.T), sizes.joints),
             keep_nominal=jnp.asarray(keep_nominal),
-            foot_size=padded(foot_size.T, sizes.feet),
+            foot_size=_padded(pose.foot_size.T, sizes.feet),
             foot_is_box=jnp.asarray(foot_is_box),
             foot_pairs=jnp.asarray(foot_pairs),
-            sphere_radius=padded(radius, sizes.spheres),
+            sphere_radius=_padded(pose.sphere_radius, sizes.spheres),
             sphere_mask=jnp.asarray(sphere_mask),
             home_height=home_height,
             imu_height=imu_height,
-            nominal_collisions=collisions,
-            dimensions=dimensions,
+            nominal_collisions=_overlapping_pairs(pose.spheres, pose.sphere_radius),
+            dimensions=pose.dimensions,
             total_mass=total_mass,
         )
 
@@ -263,3 +215,173 @@ def describe(robot: Robot, sizes: Sizes | None = None) -> Callable[[Embodiment],
         return mapped(embodiment)
 
     return function
+
+
+def _fitting(sizes: Sizes | None, robot: Robot) -> Sizes:
+    """`sizes`, by default the robot's own; ValueError if the robot does not fit into them."""
+    own = Sizes.of(robot)
+    sizes = own if sizes is None else require_kind("sizes", sizes, Sizes, "Sizes.of(*robots)")
+    for name in ("joints", "feet", "spheres"):
+        if getattr(sizes, name) < getattr(own, name):
+            raise ValueError(
+                f"sizes.{name} is {getattr(sizes, name)}, expected at least "
+                f"{getattr(own, name)} for robot {robot.name!r}; use Sizes.of with all robots"
+            )
+    return sizes
+
+
+# ------------------------------------------------------------------ the nominal pose
+
+
+class _Pose(NamedTuple):
+    """A design at its nominal pose, in the trunk frame, metres; one column per part."""
+
+    rot: jax.Array  # [3, 3, nbody] of the bodies
+    com: jax.Array  # [3, nbody] their centres of mass
+    anchor: jax.Array  # [3, J] of the actuated joints
+    axis: jax.Array  # [3, J]
+    spheres: jax.Array  # [3, S] centres of the collision spheres
+    sphere_radius: jax.Array  # [S]
+    feet: jax.Array  # [3, F] centres
+    foot_size: jax.Array  # [3, F]
+    low: jax.Array  # [3, 1] corners of the bounding box
+    high: jax.Array  # [3, 1]
+    dimensions: jax.Array  # [3] high - low
+
+    def relative(self, points):
+        """Points [3, n] within the bounding box: from -1 at its lower end to 1 at its upper."""
+        return 2 * (points - self.low) / (self.high - self.low) - 1
+
+
+def _nominal_pose(robot: Robot) -> Callable[[Embodiment], _Pose]:
+    """A function of one embodiment: forward kinematics at its nominal joint positions."""
+    model, forward = robot.model, body_kinematics(robot)
+    boxed = np.concatenate([robot.spheres, robot.feet])
+    boxed_bodies = model.geom_bodyid[boxed]
+    boxed_rot = constant_matrices(model.geom_quat[boxed])
+    # With the trunk at the origin, world coordinates are trunk coordinates.
+    origin = np.array(robot.home, np.float32)
+    origin[:7] = 0, 0, 0, 1, 0, 0, 0
+    # One-hot rows put nominal positions into qpos without a scatter.
+    place = np.zeros((robot.num_actuators, model.nq), np.float32)
+    place[np.arange(robot.num_actuators), robot.qpos_index] = 1
+    not_actuated = origin * (1 - place.sum(axis=0))
+
+    def at_nominal(e: Embodiment) -> _Pose:
+        qpos = not_actuated + jnp.sum(place * e.nominal[:, None], axis=0)
+        pos, rot, anchor, axis = forward(e, qpos)
+        com = pos + rotate(rot, e.body_ipos.T)
+        # A geom reaches as far as its rotated size triple, of which a sphere has only one entry.
+        # This is not its true extent, but what descriptions are made of.
+        box_rot = take_columns(rot, boxed_bodies)
+        local = rotate(box_rot, take_columns(e.geom_pos.T, boxed))
+        center = take_columns(pos, boxed_bodies) + local
+        size = take_columns(e.geom_size.T, boxed)
+        reach = jnp.abs(rotate(box_rot, rotate(boxed_rot, size)))
+        # The bounding box of spheres, feet, actuated joints and centres of mass.
+        anchor, axis = take_columns(anchor, robot.actuated), take_columns(axis, robot.actuated)
+        points = jnp.concatenate([anchor, com[:, 1:]], axis=-1)
+        low = jnp.min(jnp.concatenate([center - reach, points], axis=-1), axis=-1, keepdims=True)
+        high = jnp.max(jnp.concatenate([center + reach, points], axis=-1), axis=-1, keepdims=True)
+        # Without a barrier XLA computes the whole tree again for every number that uses the box.
+        low, high = jax.lax.optimization_barrier((low, high))
+        spheres = slice(None, robot.num_spheres)
+        feet = slice(robot.num_spheres, None)
+        return _Pose(
+            rot=rot,
+            com=com,
+            anchor=anchor,
+            axis=axis,
+            spheres=center[:, spheres],
+            sphere_radius=size[0, spheres],
+            feet=center[:, feet],
+            foot_size=size[:, feet],
+            low=low,
+            high=high,
+            dimensions=(high - low)[:, 0],
+        )
+
+    return at_nominal
+
+
+# ------------------------------------------------------------------ the vectors of Appendix A
+
+
+def _body_rows(e: Embodiment, pose: _Pose):
+    """Mass, centre of mass and inertia of every body: [7, nbody]."""
+    n = NORMALIZERS
+    # Principal moments are rotated like a vector, not like a tensor.
+    frames = rotation_matrices(e.body_iquat.T)
+    moments = n["inertia"](rotate(pose.rot, rotate(frames, e.body_inertia.T)))
+    return jnp.concatenate([n["mass"](e.body_mass[None]), pose.relative(pose.com), moments])
+
+
+def _whole(e: Embodiment, total_mass, dimensions):
+    """What all joints and feet are told about the whole robot: gains, mass, dimensions, [7]."""
+    n = NORMALIZERS
+    gains = [n["p_gain"](e.p_gain), n["d_gain"](e.d_gain), n["action_scale"](e.action_scale)]
+    mass = n["total_mass"](total_mass)[None]
+    return jnp.concatenate([jnp.stack(gains), mass, n["dimensions"](dimensions)])
+
+
+def _joint_rows(robot: Robot, e: Embodiment, pose: _Pose, bodies, whole, joint_range):
+    """Descriptions of the actuated joints, [30, J]."""
+    n, model = NORMALIZERS, robot.model
+    joints, dofs = robot.joints[robot.actuated], robot.qvel_index
+    own = model.jnt_bodyid[joints]
+    children = np.bincount(model.body_parentid[1:], minlength=model.nbody)[own]
+    return jnp.concatenate(
+        [
+            pose.relative(pose.anchor),
+            pose.axis,
+            take_columns(bodies, own),
+            n["children"](children[None]).astype(np.float32),
+            n["nominal"](e.nominal[None]),
+            n["torque"](e.actuator_forcerange[None, :, 1]),
+            n["velocity"](e.velocity_limits[None]),
+            n["damping"](take_columns(e.dof_damping, dofs)[None]),
+            n["armature"](take_columns(e.dof_armature, dofs)[None]),
+            n["stiffness"](take_columns(e.jnt_stiffness, joints)[None]),
+            n["friction"](take_columns(e.dof_frictionloss, dofs)[None]),
+            n["range"](joint_range),
+            jnp.broadcast_to(whole[:, None], (len(whole), len(joints))),
+        ]
+    )
+
+
+def _foot_rows(robot: Robot, pose: _Pose, bodies, whole):
+    """Descriptions of the feet, [21, F]."""
+    n = NORMALIZERS
+    return jnp.concatenate(
+        [
+            pose.relative(pose.feet),
+            take_columns(bodies, robot.foot_bodies),
+            n["foot_size"](pose.foot_size),
+            n["foot_type"](robot.foot_types[None]).astype(np.float32),
+            jnp.broadcast_to(whole[:, None], (len(whole), robot.num_feet)),
+        ]
+    )
+
+
+def _overlapping_pairs(centers, radius):
+    """Number of pairs that overlap, float32 [], of spheres with centres [3, S] and radii [S]."""
+    above_diagonal = np.triu(np.ones((radius.shape[0],) * 2, bool), k=1)
+    distance2 = sum((row[:, None] - row[None]) ** 2 for row in centers)
+    touching = distance2 <= (radius[:, None] + radius[None]) ** 2
+    return jnp.sum(jnp.where(above_diagonal, touching, False).astype(jnp.float32))
+
+
+# ------------------------------------------------------------------ padding
+
+
+def _padded(values, length: int):
+    """float32 with zeros added to the first axis."""
+    values = jnp.asarray(values, jnp.float32)
+    return jnp.pad(values, [(0, length - values.shape[0])] + [(0, 0)] * (values.ndim - 1))
+
+
+def _padded_constant(values, length: int, axes: int = 1) -> np.ndarray:
+    """float32 with zeros added to the first `axes` axes."""
+    values = np.asarray(values, np.float32)
+    pad = [(0, length - n) for n in values.shape[:axes]]
+    return np.pad(values, pad + [(0, 0)] * (values.ndim - axes))

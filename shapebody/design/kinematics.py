@@ -7,12 +7,17 @@ from dataclasses import dataclass
 
 import jax
 import jax.numpy as jnp
-import mujoco
 import numpy as np
 
 from shapebody.design.phi import Embodiment
 from shapebody.robot.robot import Robot, require_robot
-from shapebody.rotations import quaternion_product
+from shapebody.rotations import (
+    compose,
+    constant_matrices,
+    quaternion_product,
+    rotate,
+    rotation_matrices,
+)
 
 
 @jax.tree_util.register_dataclass
@@ -34,28 +39,7 @@ class Frames:
     com: jax.Array  # [nbody, 3] centres of mass
 
 
-def _matrix(q):
-    """Rotations [3, 3, n] of unit quaternions [4, n]."""
-    w, x, y, z = q
-    rows = [
-        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-    ]
-    return jnp.stack([jnp.stack(row) for row in rows])
-
-
-def _rotate(rotation, vector):
-    """Rotated vectors [3, n] = rotation [3, 3, n] · vector [3, n]."""
-    return rotation[:, 0] * vector[0] + rotation[:, 1] * vector[1] + rotation[:, 2] * vector[2]
-
-
-def _compose(first, second):
-    """Rotation products [3, 3, n]."""
-    return jnp.stack([_rotate(first, second[:, column]) for column in range(3)], axis=1)
-
-
-def _take(rows, index):
+def take_columns(rows, index):
     """Columns `index` (constant) of rows [..., n]."""
     index = np.asarray(index)
     return rows if np.array_equal(index, np.arange(rows.shape[-1])) else rows[..., index]
@@ -97,7 +81,7 @@ def _plan(robot: Robot):
     return *table, bodies, flat(of_joint[joint] for joint in range(1, model.njnt))
 
 
-def _tree(robot: Robot):
+def body_kinematics(robot: Robot):
     """Forward kinematics of the bodies of one design, as a scan over the levels of the tree.
 
     Returns a function (embodiment, qpos) -> body positions [3, nbody], body rotations
@@ -114,7 +98,7 @@ def _tree(robot: Robot):
         quat, pos = above
         parent, local_quat, local_pos = level
         quat, pos = quat[:, parent], pos[:, parent]
-        pos = pos + _rotate(_matrix(quat), local_pos)
+        pos = pos + rotate(rotation_matrices(quat), local_pos)
         quat = quaternion_product(quat, local_quat)
         return (quat, pos), (quat, pos)
 
@@ -126,8 +110,8 @@ def _tree(robot: Robot):
         local_quat = quaternion_product(
             offset_quat, jnp.concatenate([jnp.cos(half)[None], jnp.sin(half) * axis])
         )
-        local_pos = offset + _rotate(_matrix(offset_quat), center)
-        local_pos = local_pos - _rotate(_matrix(local_quat), center)
+        local_pos = offset + rotate(rotation_matrices(offset_quat), center)
+        local_pos = local_pos - rotate(rotation_matrices(local_quat), center)
 
         def by_level(rows):
             return jnp.moveaxis(rows.reshape(-1, *parent.shape), 0, 1)
@@ -143,12 +127,12 @@ def _tree(robot: Robot):
 
         # All nodes at once again: their frames in the world.
         quat, pos = flat(quat), flat(pos)
-        rot = _matrix(quat)
-        anchor = pos + _rotate(rot, center)
+        rot = rotation_matrices(quat)
+        anchor = pos + rotate(rot, center)
         world = np.array([[1.0], [0], [0], [0]], np.float32)
         quat = jnp.concatenate([world, root_quat, quat[:, of_body]], axis=-1)
         pos = jnp.concatenate([world[1:], root_pos, pos[:, of_body]], axis=-1)
-        return pos, _matrix(quat), anchor[:, of_joint], _rotate(rot, axis)[:, of_joint]
+        return pos, rotation_matrices(quat), anchor[:, of_joint], rotate(rot, axis)[:, of_joint]
 
     return forward
 
@@ -159,33 +143,25 @@ def kinematics(robot: Robot) -> Callable[[Embodiment, jax.Array], Frames]:
     Agrees with MuJoCo's `mj_kinematics` (which also normalizes the free joint's quaternion).
     """
     model = require_robot(robot).model
-    tree = _tree(robot)
-    geom_rot = _constant_rotations(model.geom_quat)
-    site_rot = _constant_rotations(model.site_quat)
+    tree = body_kinematics(robot)
+    geom_rot = constant_matrices(model.geom_quat)
+    site_rot = constant_matrices(model.site_quat)
 
     def frames(embodiment: Embodiment, qpos) -> Frames:
         e = embodiment
         pos, rot, anchor, axis = tree(e, qpos)
-        geom_body = _take(rot, model.geom_bodyid)
-        site_body = _take(rot, model.site_bodyid)
+        geom_body = take_columns(rot, model.geom_bodyid)
+        site_body = take_columns(rot, model.site_bodyid)
         return Frames(
             body_pos=pos.T,
             body_rot=jnp.moveaxis(rot, -1, 0),
-            geom_pos=(_take(pos, model.geom_bodyid) + _rotate(geom_body, e.geom_pos.T)).T,
-            geom_rot=jnp.moveaxis(_compose(geom_body, geom_rot), -1, 0),
-            site_pos=(_take(pos, model.site_bodyid) + _rotate(site_body, e.site_pos.T)).T,
-            site_rot=jnp.moveaxis(_compose(site_body, site_rot), -1, 0),
+            geom_pos=(take_columns(pos, model.geom_bodyid) + rotate(geom_body, e.geom_pos.T)).T,
+            geom_rot=jnp.moveaxis(compose(geom_body, geom_rot), -1, 0),
+            site_pos=(take_columns(pos, model.site_bodyid) + rotate(site_body, e.site_pos.T)).T,
+            site_rot=jnp.moveaxis(compose(site_body, site_rot), -1, 0),
             joint_anchor=anchor.T,
             joint_axis=axis.T,
-            com=(pos + _rotate(rot, e.body_ipos.T)).T,
+            com=(pos + rotate(rot, e.body_ipos.T)).T,
         )
 
     return frames
-
-
-def _constant_rotations(quaternions):
-    """Rotations [3, 3, n] of constant quaternions [n, 4], as NumPy."""
-    rotations = np.zeros((len(quaternions), 9))
-    for rotation, quaternion in zip(rotations, quaternions, strict=True):
-        mujoco.mju_quat2Mat(rotation, quaternion)
-    return np.ascontiguousarray(np.moveaxis(rotations.reshape(-1, 3, 3), 0, -1), np.float32)

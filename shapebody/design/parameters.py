@@ -63,6 +63,30 @@ BLOCKS = (
     Block("action_scale", "action scale", "Action scale", "global", ("",), 0.5, "rad"),
 )
 
+
+def block_slices(
+    num_bodies: int, num_joints: int, num_actuators: int, num_feet: int
+) -> dict[str, slice]:
+    """Where each block lies in a design f [d], by its key, in the order of `BLOCKS`.
+
+    d = 9 + 13 nb + 11 nj + 3 nu + 3 nf, with nb bodies (without the world), nj hinge joints, nu
+    actuators and nf feet. Entries of a block are in the order of MuJoCo's ids, components last.
+    """
+    counts = {
+        "global": 1,
+        "body": num_bodies,
+        "joint": num_joints,
+        "actuator": num_actuators,
+        "foot": num_feet,
+    }
+    slices, offset = {}, 0
+    for block in BLOCKS:
+        length = counts[block.over] * len(block.components)
+        slices[block.key] = slice(offset, offset + length)
+        offset += length
+    return slices
+
+
 # Rows of the paper's figure of grouped design changes, from top to bottom.
 KINDS = (
     "P gain",

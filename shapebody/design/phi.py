@@ -1,4 +1,31 @@
-"""The design map Φ: from a design f to an embodiment (Section 3, Appendix A)."""
+"""The design map Φ: from a design f to a robot body e = Φ(f) (Section 3 and Appendix A).
+
+A *design* f is a vector in [-1, 1]^d. Every entry stands for one continuous property of a robot:
+the mass of a body, the torque limit of a motor, the D gain of all of them. The entries lie in 26
+blocks of fixed order (`parameters.BLOCKS`), one entry per body, joint, motor, foot or for the whole
+robot, and each block has a range R. An *embodiment* e holds the properties themselves, in
+kilograms, metres and radians, as a physics engine wants them (`Embodiment`).
+
+Φ starts from a reference robot and changes it in one of two ways:
+
+- factors: value = reference x size x (1 + R f), for masses, inertias, torque limits, gains, ...
+- offsets: value = reference x size + R f, for positions, angles, joint ranges, ...
+
+where "size" is a power of the first block's three factors s (x, y, z) or of their mean a: lengths
+grow with s, masses with a³, inertias with s⁵. So f = 0 gives the reference, and |f| is the distance
+from it that the trust region of the search bounds.
+
+Φ is written once, in JAX, as plain formulas. It can be compiled, mapped over designs and
+differentiated, and it is smooth in f but for two kinds of clipping (passive joint forces at 0,
+nominal positions at the joint limits). The search uses exactly this: the chain rule carries the
+critic's gradient with respect to the body back to the design, ∂V/∂f = ∂V/∂e · ∂Φ/∂f.
+
+The paper names the properties; order, ranges and formulas were recovered from the authors'
+published designs, which Φ reproduces to the digits they are printed with.
+
+>>> space = DesignSpace(load_robot("unitree_go2"))
+>>> body = phi(space.reference_robot, space.start(0))     # the same as space(space.start(0))
+"""
 
 from __future__ import annotations
 
@@ -9,10 +36,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from shapebody.arguments import require_array, require_integer, require_kind, single
-from shapebody.design.parameters import BLOCKS
-from shapebody.robot.robot import Robot, require_robot
-from shapebody.rotations import quaternion_product
+from shapebody.arguments import require_kind, require_shape
+from shapebody.design.parameters import BLOCKS, block_slices, soft_limits
+from shapebody.robot.robot import Robot
+from shapebody.rotations import turned
 
 
 @jax.tree_util.register_dataclass
@@ -58,135 +85,194 @@ MODEL_FIELDS = tuple(
 )
 
 
-def rotation_axes(generator: np.random.Generator, joint_axes: np.ndarray, num_bodies: int):
-    """Directions of the rotations in Φ, drawn from `generator`.
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class Reference:
+    """What Φ starts from: a robot's own embodiment, and constants that no design changes.
 
-    Returns unit vectors (inertia [nb, 3], body [nb, 3], joint [nj, 3]), the last perpendicular to
-    the reference `joint_axes` [nj, 3].
+    Made by `reference_of`; a pytree of float32 arrays, so that it can be passed into compiled code.
+    nb bodies (without the world), nj hinge joints, nu motors, nf feet.
     """
 
-    require_kind("generator", generator, np.random.Generator, "numpy.random.default_rng(0)")
-    joint_axes = require_array("joint_axes", joint_axes, ("nj", 3))
-    require_integer("num_bodies", num_bodies, 1, 10**6)
+    embodiment: Embodiment  # of the robot as it is
+    soft_limits: jax.Array  # [nu, 2] rad, which bound the nominal positions
+    inertia_axes: jax.Array  # [nb, 3] unit vectors about which inertia frames turn
+    body_axes: jax.Array  # [nb, 3] ... and bodies
+    axis_directions: jax.Array  # [nj, 3] unit vectors towards which joint axes tilt
+    on_robot_geoms: jax.Array  # [ngeom] 1 for geoms of the robot, 0 for the floor's
+    on_robot_sites: jax.Array  # [nsite]
+    feet: jax.Array  # [ngeom, nf] 1 where a geom is that foot
+    size_share: jax.Array  # [ngeom, 3] share of each entry of a geom's size in its squared norm
+    imu: jax.Array  # [nsite, 1] 1 for the site of the IMU
 
-    def normalized(vectors):
-        return vectors / np.linalg.norm(vectors, axis=1, keepdims=True)
-
-    inertia = normalized(generator.normal(size=(num_bodies, 3)))
-    body = normalized(generator.normal(size=(num_bodies, 3)))
-    angle = generator.uniform(0, 2 * np.pi, size=(len(joint_axes), 1))
-    rows = np.arange(len(joint_axes))
-    smallest = np.argmin(np.abs(joint_axes), axis=1)
-    following, last = (smallest + 1) % 3, (smallest + 2) % 3
-    first = np.zeros_like(joint_axes)
-    first[rows, following] = joint_axes[rows, last]
-    first[rows, last] = -joint_axes[rows, following]
-    first = normalized(first)
-    joint = np.cos(angle) * first + np.sin(angle) * np.cross(joint_axes, first)
-    return inertia, body, joint
-
-
-def published_axes_seed(f) -> int:
-    """The generator seed that the published designs derive from their own f [d] (float32)."""
-    f = require_array("f", single(require_array("f", f)))
-    total = abs(float(np.sum(f.astype(np.float64))))
-    return int(total * 1e6) ^ 0x5A5A5A5A
+    @property
+    def slices(self) -> dict[str, slice]:
+        """Where each block of a design lies in f."""
+        return block_slices(
+            num_bodies=self.inertia_axes.shape[0],
+            num_joints=self.axis_directions.shape[0],
+            num_actuators=self.embodiment.nominal.shape[0],
+            num_feet=self.feet.shape[1],
+        )
 
 
-def published_axes(robot: Robot, f):
-    """Rotation axes (inertia, body, joint) that the published design f [d] was built with."""
-    require_array("f", f, (require_robot(robot).design_dim,))
-    generator = np.random.default_rng(published_axes_seed(f))
-    return rotation_axes(generator, robot.model.jnt_axis[robot.joints], robot.num_bodies)
+def phi(reference: Reference, f) -> Embodiment:
+    """The design map: e = Φ(f), of one design.
 
+    Pure: can be compiled, mapped over designs with `jax.vmap`, and differentiated.
 
-def _turned(quaternions, axis, angle):
-    """Quaternions [n, 4] after rotations by `angle` [n] about unit vectors `axis` [n, 3]."""
-    half = 0.5 * angle
-    turn = jnp.concatenate([jnp.cos(half)[None], jnp.sin(half) * axis.T])
-    return quaternion_product(turn, quaternions.T).T
+    Args:
+        reference: of a robot, `DesignSpace.reference_robot`.
+        f: float32 [d], within [-1, 1] (which is not looked at: `DesignSpace.validate` does that).
 
+    Raises:
+        TypeError: for another reference.
+        ValueError: for an f of another length.
+    """
+    require_kind("reference", reference, Reference, "DesignSpace(robot).reference_robot")
+    x = _changes(reference, f)
+    robot = reference.embodiment
 
-def phi(constants: dict, slices: dict[str, slice], f) -> Embodiment:
-    """Φ for one design f [d]: formulas of the 26 blocks."""
-    c = constants
-    entries = {}
-    for block in BLOCKS:
-        entry = f[slices[block.key]]
-        components = len(block.components)
-        entries[block.key] = entry.reshape(-1, components) if components > 1 else entry
-    x = {block.key: block.range * entries[block.key] for block in BLOCKS}
-
+    # Block 1, size: lengths along x, y and z are multiplied by s = 1 + R f; a is the mean of s.
     s = 1 + x["size"][0]
-    a = 1 + jnp.mean(x["size"])  # the mean of s, exactly 1 at the reference
+    a = 1 + jnp.mean(x["size"])  # exactly 1 at the reference
 
-    def with_world(name, values):
-        return jnp.concatenate([c[name][:1], values])
-
+    # Blocks 2 to 4, mass m = m₀ a³ c (1 + R f) and principal inertias I = I₀ s⁵ c (1 + R f):
+    # c = 1 + R f changes both together, the other two each alone.
     coupled = 1 + x["coupled_mass"]
-    mass = c["body_mass"][1:] * a**3 * coupled * (1 + x["mass"])
-    inertia = c["body_inertia"][1:] * s**5 * coupled[:, None] * (1 + x["inertia"])
-    iquat = _turned(c["body_iquat"][1:], c["inertia_axes"], x["iquat"])
-    quat = _turned(c["body_quat"][1:], c["body_axes"], x["quat"])
+    mass = robot.body_mass[1:] * a**3 * coupled * (1 + x["mass"])
+    inertia = robot.body_inertia[1:] * s**5 * coupled[:, None] * (1 + x["inertia"])
 
-    on_robot = c["geom_on_robot"] > 0
-    geom_scale = jnp.where(on_robot, a, 1)
+    # Blocks 5 to 8, frames of the inertia and of the body: p = p₀ s + R f, turned by the angle R f
+    # about a constant axis.
+    ipos = robot.body_ipos[1:] * s + x["ipos"]
+    iquat = turned(robot.body_iquat[1:], reference.inertia_axes, x["iquat"])
+    pos = robot.body_pos[1:] * s + x["pos"]
+    quat = turned(robot.body_quat[1:], reference.body_axes, x["quat"])
+
+    # Block 9, IMU: p = p₀ s + R f. The other sites, like geoms, only follow the size.
+    site_scale = jnp.where(reference.on_robot_sites[:, None] > 0, s, 1)
+    site_pos = robot.site_pos * site_scale + reference.imu * x["imu"]
+
+    # Block 10, feet: r = r₀ a (1 + R f), and so the radius of the bounding sphere.
     # One-hot sums instead of scatters: exact, and faster in a batch on a CPU.
-    foot_scale = 1 + jnp.sum(c["feet"][:, :, None] * x["foot"], axis=1)
-    geom_size = c["geom_size"] * geom_scale[:, None] * foot_scale
+    on_robot = reference.on_robot_geoms > 0
+    geom_scale = jnp.where(on_robot, a, 1)
+    foot_scale = 1 + jnp.sum(reference.feet[:, :, None] * x["foot"], axis=1)
+    geom_size = robot.geom_size * geom_scale[:, None] * foot_scale
     # The bounding radius of a sphere or a box is the norm of its size; written relative to the
     # reference, so that f = 0 gives exactly that.
-    stretch = jnp.sqrt(1 + jnp.sum(c["size_share"] * (foot_scale**2 - 1), axis=1))
-    rbound = c["geom_rbound"] * geom_scale * stretch
+    stretch = jnp.sqrt(1 + jnp.sum(reference.size_share * (foot_scale**2 - 1), axis=1))
+    rbound = robot.geom_rbound * geom_scale * stretch
+    geom_pos = robot.geom_pos * jnp.where(on_robot[:, None], s, 1)
 
-    site_on_robot = c["site_on_robot"][:, None] > 0
-
+    # Block 11, joint axes: tilted by the angle R f towards a constant perpendicular direction.
     cosine, sine = jnp.cos(x["axis"])[:, None], jnp.sin(x["axis"])[:, None]
-    axis = cosine * c["jnt_axis"][1:] + sine * c["axis_directions"]
+    axis = cosine * robot.jnt_axis[1:] + sine * reference.axis_directions
 
-    def passive(reference, key):
-        return jnp.maximum(0, reference * a * (1 + x[key]) + x[key + "_add"])
+    # Blocks 12, 24 and 25, motors: v = v₀ a (1 + R f) for the torque limit of each and the gains
+    # of all. A motor is a position servo, torque = P (target - q) - D q̇, whose gains MuJoCo keeps
+    # in two tables.
+    torque = robot.actuator_forcerange[:, 1] * a * (1 + x["torque"])
+    p_gain = (robot.p_gain * a * (1 + x["p_gain"]))[0]
+    d_gain = (robot.d_gain * a * (1 + x["d_gain"]))[0]
+    p_column = jnp.broadcast_to(p_gain, (len(torque), 1))
+    d_column = jnp.broadcast_to(d_gain, (len(torque), 1))
+    gain, bias = robot.actuator_gainprm, robot.actuator_biasprm
 
-    def scaled(key):
-        return c[key] * a * (1 + x[key])
+    # Blocks 13 and 15, nominal positions and joint ranges: q = q₀ + R f. The former stay within
+    # the soft limits of the reference, at f = 0 too; the latter are not ordered.
+    low, high = reference.soft_limits[:, 0], reference.soft_limits[:, 1]
+    nominal = jnp.clip(robot.nominal + x["nominal"], low, high)
+    jnt_range = robot.jnt_range[1:] + x["range"]
 
-    def joints_of(name, key):
-        return jnp.concatenate([c[name][:6], passive(c[name][6:], key)])
+    # Blocks 16 to 23, passive forces of the joints: v = max(0, v₀ a (1 + R f) + R' f').
+    def passive(values, key):
+        return jnp.maximum(0, values * a * (1 + x[key]) + x[f"{key}_add"])
 
-    limits = c["soft_limits"]
-    nominal = jnp.clip(c["nominal"] + x["nominal"], limits[:, 0], limits[:, 1])
-    torque = scaled("torque")
-    p_gain = scaled("p_gain")[0]
-    d_gain = scaled("d_gain")[0]
-    num_actuators = len(c["torque"])
-    p_column = jnp.broadcast_to(p_gain, (num_actuators, 1))
-    d_column = jnp.broadcast_to(d_gain, (num_actuators, 1))
-    gain, bias = c["actuator_gainprm"], c["actuator_biasprm"]
+    stiffness = passive(robot.jnt_stiffness[1:], "stiffness")
+    damping = passive(robot.dof_damping[6:], "damping")
+    armature = passive(robot.dof_armature[6:], "armature")
+    frictionloss = passive(robot.dof_frictionloss[6:], "friction")
+
+    # Blocks 14 and 26, what the environment applies: v = v₀ a (1 + R f) for the velocity limits,
+    # to which it clips the joints' velocities, and for the angle that an action of 1 stands for.
+    velocity = robot.velocity_limits * a * (1 + x["velocity"])
+    action_scale = (robot.action_scale * a * (1 + x["action_scale"]))[0]
 
     return Embodiment(
-        body_mass=with_world("body_mass", mass),
-        body_inertia=with_world("body_inertia", inertia),
-        body_ipos=with_world("body_ipos", c["body_ipos"][1:] * s + x["ipos"]),
-        body_iquat=with_world("body_iquat", iquat),
-        body_pos=with_world("body_pos", c["body_pos"][1:] * s + x["pos"]),
-        body_quat=with_world("body_quat", quat),
-        site_pos=c["site_pos"] * jnp.where(site_on_robot, s, 1) + c["imu"] * x["imu"],
-        geom_pos=c["geom_pos"] * jnp.where(on_robot[:, None], s, 1),
+        body_mass=_completed(robot.body_mass, mass),
+        body_inertia=_completed(robot.body_inertia, inertia),
+        body_ipos=_completed(robot.body_ipos, ipos),
+        body_iquat=_completed(robot.body_iquat, iquat),
+        body_pos=_completed(robot.body_pos, pos),
+        body_quat=_completed(robot.body_quat, quat),
+        site_pos=site_pos,
+        geom_pos=geom_pos,
         geom_size=geom_size,
         geom_rbound=rbound,
-        jnt_pos=with_world("jnt_pos", c["jnt_pos"][1:] * s),
-        jnt_axis=with_world("jnt_axis", axis),
-        jnt_range=with_world("jnt_range", c["jnt_range"][1:] + x["range"]),
-        jnt_stiffness=with_world("jnt_stiffness", passive(c["jnt_stiffness"][1:], "stiffness")),
-        dof_damping=joints_of("dof_damping", "damping"),
-        dof_armature=joints_of("dof_armature", "armature"),
-        dof_frictionloss=joints_of("dof_frictionloss", "friction"),
+        jnt_pos=_completed(robot.jnt_pos, robot.jnt_pos[1:] * s),
+        jnt_axis=_completed(robot.jnt_axis, axis),
+        jnt_range=_completed(robot.jnt_range, jnt_range),
+        jnt_stiffness=_completed(robot.jnt_stiffness, stiffness),
+        dof_damping=_completed(robot.dof_damping, damping),
+        dof_armature=_completed(robot.dof_armature, armature),
+        dof_frictionloss=_completed(robot.dof_frictionloss, frictionloss),
         actuator_forcerange=jnp.stack([-torque, torque], axis=-1),
         actuator_gainprm=jnp.concatenate([p_column, gain[:, 1:]], axis=1),
         actuator_biasprm=jnp.concatenate([bias[:, :1], -p_column, -d_column, bias[:, 3:]], axis=1),
         nominal=nominal,
-        velocity_limits=scaled("velocity"),
+        velocity_limits=velocity,
         p_gain=p_gain,
         d_gain=d_gain,
-        action_scale=scaled("action_scale")[0],
+        action_scale=action_scale,
     )
+
+
+def _changes(reference: Reference, f) -> dict[str, jax.Array]:
+    """R f by key of the block, [n], or [n, 3] and [n, 2] where bodies or joints have several."""
+    slices = reference.slices
+    require_shape("f", f, (list(slices.values())[-1].stop,))
+    changes = {}
+    for block in BLOCKS:
+        entries = f[slices[block.key]]
+        components = len(block.components)
+        entries = entries.reshape(-1, components) if components > 1 else entries
+        changes[block.key] = block.range * entries
+    return changes
+
+
+def _completed(reference, values):
+    """`values` after those rows of the reference that no design changes: the world's, or the free
+    joint's, which come first."""
+    return jnp.concatenate([reference[: len(reference) - len(values)], values])
+
+
+def reference_of(robot: Robot, inertia_axes, body_axes, joint_axes) -> Reference:
+    """What Φ needs of a robot. The axes are those of `axes.rotation_axes`, [nb, 3] or [nj, 3]."""
+    model = robot.model
+    control = dict(
+        nominal=robot.nominal,
+        velocity_limits=robot.velocity_limits,
+        p_gain=robot.p_gain,
+        d_gain=robot.d_gain,
+        action_scale=robot.action_scale,
+    )
+    feet = np.zeros((model.ngeom, robot.num_feet))
+    feet[robot.feet, np.arange(robot.num_feet)] = 1
+    squares = model.geom_size**2
+    imu = np.zeros((model.nsite, 1))
+    imu[robot.imu_site] = 1
+    reference = Reference(
+        embodiment=Embodiment(**{name: getattr(model, name) for name in MODEL_FIELDS}, **control),
+        soft_limits=soft_limits(model.jnt_range[robot.joints[robot.actuated]]),
+        inertia_axes=inertia_axes,
+        body_axes=body_axes,
+        axis_directions=np.cross(joint_axes, model.jnt_axis[robot.joints]),
+        on_robot_geoms=model.geom_bodyid > 0,
+        on_robot_sites=model.site_bodyid > 0,
+        feet=feet,
+        size_share=squares / np.maximum(squares.sum(axis=1, keepdims=True), 1e-30),
+        imu=imu,
+    )
+    return jax.tree.map(lambda value: np.asarray(value, np.float32), reference)

@@ -21,23 +21,18 @@ from shapebody.arguments import (
     require_text,
     single,
 )
+from shapebody.design.axes import published_axes, rotation_axes
 from shapebody.design.export import build_model, write_mjcf
 from shapebody.design.parameters import (
     BLOCKS,
     KINDS,
     Parameter,
+    block_slices,
     parameter_table,
     part_label,
     part_name,
-    soft_limits,
 )
-from shapebody.design.phi import (
-    MODEL_FIELDS,
-    Embodiment,
-    phi,
-    published_axes,
-    rotation_axes,
-)
+from shapebody.design.phi import Embodiment, phi, reference_of
 from shapebody.robot.robot import Robot, require_robot
 
 MOST_STARTS = 2**63
@@ -63,20 +58,10 @@ class DesignSpace:
 
     def __init__(self, robot: Robot, axes_seed: int = 0, published_axes_of=None):
         self.robot = require_robot(robot)
-        counts = {
-            "global": 1,
-            "body": robot.num_bodies,
-            "joint": robot.num_joints,
-            "actuator": robot.num_actuators,
-            "foot": robot.num_feet,
-        }
-        self.slices: dict[str, slice] = {}
-        offset = 0
-        for block in BLOCKS:
-            length = counts[block.over] * len(block.components)
-            self.slices[block.key] = slice(offset, offset + length)
-            offset += length
-        self.dim = offset
+        self.slices = block_slices(
+            robot.num_bodies, robot.num_joints, robot.num_actuators, robot.num_feet
+        )
+        self.dim = robot.design_dim
         self.reference = np.zeros(self.dim, np.float32)
         if published_axes_of is None:
             generator = np.random.default_rng(require_seed("axes_seed", axes_seed))
@@ -85,7 +70,8 @@ class DesignSpace:
             axes = published_axes(robot, self._one(published_axes_of))
         self.inertia_axes, self.body_axes, self.joint_axes = axes
         self._check_layout()
-        self._jitted = jax.jit(functools.partial(phi, self._constants(), self.slices))
+        self.reference_robot = reference_of(robot, *axes)
+        self._jitted = jax.jit(functools.partial(phi, self.reference_robot))
 
     def _check_layout(self):
         model, robot = self.robot.model, self.robot
@@ -151,35 +137,6 @@ class DesignSpace:
         for _ in range(f.ndim - 1):
             function = jax.vmap(function)
         return function(f)
-
-    def _constants(self) -> dict:
-        """Reference values of the robot and constants of Φ, as float32 arrays."""
-        robot, model = self.robot, self.robot.model
-        feet = np.zeros((model.ngeom, robot.num_feet))
-        feet[robot.feet, np.arange(robot.num_feet)] = 1
-        squares = model.geom_size**2
-        size_share = squares / np.maximum(squares.sum(axis=1, keepdims=True), 1e-30)
-        imu = np.zeros((model.nsite, 1))
-        imu[robot.imu_site] = 1
-        constants = {name: getattr(model, name) for name in MODEL_FIELDS}
-        constants.update(
-            nominal=robot.nominal,
-            soft_limits=soft_limits(model.jnt_range[robot.joints[robot.actuated]]),
-            velocity=robot.velocity_limits,
-            torque=model.actuator_forcerange[:, 1],
-            p_gain=robot.p_gain,
-            d_gain=robot.d_gain,
-            action_scale=robot.action_scale,
-            inertia_axes=self.inertia_axes,
-            body_axes=self.body_axes,
-            axis_directions=np.cross(self.joint_axes, model.jnt_axis[robot.joints]),
-            geom_on_robot=model.geom_bodyid > 0,
-            site_on_robot=model.site_bodyid > 0,
-            feet=feet,
-            size_share=size_share,
-            imu=imu,
-        )
-        return {name: np.asarray(value, np.float32) for name, value in constants.items()}
 
     @functools.cached_property
     def parameters(self) -> list[Parameter]:

@@ -30,8 +30,9 @@ from shapebody.evaluation.statistics import (
 from shapebody.networks.config import PolicyConfig
 from shapebody.networks.policy import Policy
 from shapebody.robot.robot import Robot
+from shapebody.task.batch import RESET_SLOTS
 from shapebody.task.config import TaskConfig
-from shapebody.task.env import RESET_SLOTS, Locomotion
+from shapebody.task.env import Locomotion
 
 _CALLS = 50
 """Control steps between two reports, and per call of an engine that runs whole rollouts."""

@@ -21,7 +21,6 @@ import numpy as np
 
 from shapebody.arguments import (
     require_array,
-    require_choice,
     require_integer,
     require_kind,
     require_shape,
@@ -74,46 +73,31 @@ class MjxPhysics:
     Args:
       robot: the robot.
       num_envs: N, the number of simulations.
-      impl: "jax", or "warp" for MuJoCo Warp, which needs the package warp-lang and is meant for
-        CUDA. On a CPU it agreed with the other engines; on CUDA it has not been tested.
       substeps: physics steps per control step; 4 of 0.005 s make the paper's 50 Hz.
       solver_iterations: Newton iterations per physics step.
       line_search: line-search steps per Newton iteration.
-
-    Raises:
-      ValueError: an unknown implementation.
-      RuntimeError: "warp" without its package.
     """
 
     def __init__(
         self,
         robot: Robot,
         num_envs: int,
-        impl: str = "jax",
         substeps: int = 4,
         solver_iterations: int = 4,
         line_search: int = 8,
     ):
-        _check_implementation(impl)
         self.robot = robot
         self.num_envs = require_integer("num_envs", num_envs, 1, MOST_SIMULATIONS)
         self.substeps = require_integer("substeps", substeps, 1, MOST_SUBSTEPS)
         model = prepare(robot, solver_iterations, line_search)
-        # MJX has no automatic reset, and Warp refuses the flag that switches it off.
+        # MJX has no automatic reset that could be switched off.
         model.opt.disableflags &= ~int(mujoco.mjtDisableBit.mjDSBL_AUTORESET)
         self._home_sensordata = home_sensordata(robot, model)
         self._hinge_dofs = model.jnt_type[model.dof_jntid] == mujoco.mjtJoint.mjJNT_HINGE
         model.dof_frictionloss[self._hinge_dofs] = 1.0
         self.model = model
-        self._mjx_model = mjx.put_model(model, impl=impl)
-        # Warp allocates room for contacts of all simulations and constraints of each one: at most
-        # four contacts of four rows per pair, and friction and two limits per hinge.
-        sizes = {
-            "naconmax": 4 * model.npair * self.num_envs,
-            "njmax": 16 * model.npair + 3 * int(self._hinge_dofs.sum()),
-        }
-        sizes = sizes if impl == "warp" else {}
-        self._mjx_data = mjx.make_data(model, impl=impl, **sizes)
+        self._mjx_model = mjx.put_model(model, impl="jax")
+        self._mjx_data = mjx.make_data(model, impl="jax")
 
     def init(self, embodiments: Embodiment, qpos: jax.Array, qvel: jax.Array) -> PhysicsState:
         """Start all simulations.
@@ -296,16 +280,3 @@ def _where(mask: jax.Array, new: Any, old: Any) -> Any:
 
 def _require_state(state) -> None:
     require_kind("state", state, PhysicsState, "what init, reset or step returned")
-
-
-def _check_implementation(impl: str) -> None:
-    require_choice("impl", impl, ("jax", "warp"))
-    if impl == "jax":
-        return
-    import mujoco.mjx.warp as mjx_warp
-
-    if not mjx_warp.WARP_INSTALLED:
-        raise RuntimeError(
-            "impl='warp' needs the package warp-lang, which is not installed: install "
-            f"'mujoco-mjx[warp]=={mujoco.__version__}', or use impl='jax'"
-        )

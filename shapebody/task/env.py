@@ -1,16 +1,16 @@
-"""The locomotion environment: episodes of `episode.py` on one of two physics engines.
+"""The locomotion environment: episodes of `episode` on one of two physics engines.
 
-With the native engine a Python loop alternates jitted task code with one threaded call of
-C MuJoCo; with MJX the whole rollout is one jitted scan. Environments of several robots
-share one batch: joints, feet and spheres are padded to the largest robot and masked.
+`Locomotion` is what the rest of the package uses. The loops are elsewhere, one for each engine:
+`native_rollout` alternates compiled task code with one threaded call of C MuJoCo, `mjx_rollout`
+compiles a whole rollout. Environments of several robots share one `batch`.
 """
 
+from __future__ import annotations
+
 import copy
-import inspect
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
-from functools import partial
-from typing import Any, NamedTuple
+from dataclasses import replace
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -19,7 +19,6 @@ import numpy as np
 from shapebody.arguments import (
     refuse,
     require_array,
-    require_engine,
     require_flag,
     require_function,
     require_integer,
@@ -29,136 +28,21 @@ from shapebody.arguments import (
     require_number,
     single,
 )
-from shapebody.design.descriptions import Descriptions, Sizes, describe
-from shapebody.design.kinematics import kinematics
-from shapebody.design.space import DesignSpace
+from shapebody.design.descriptions import Descriptions, Sizes
+from shapebody.physics.engine import resolved, simulator
 from shapebody.robot.robot import Robot, require_robot
-from shapebody.rotations import quaternion_product
-from shapebody.task import episode as episodes
-from shapebody.task import randomization
+from shapebody.task import mjx_rollout, native_rollout
+from shapebody.task.batch import Batch, RobotGroup
 from shapebody.task.config import TaskConfig
 from shapebody.task.episode import Episode, Outcome
-from shapebody.task.observations import Observation
-from shapebody.task.sensors import Readings, reader
-
-RESET_SLOTS = 16
-"""Finished environments are restarted in chunks of this size, so that one compiled
-function serves any number of them."""
+from shapebody.task.randomization import draw_designs
+from shapebody.task.trajectory import Policy, StepRecord, Trajectory
 
 MOST_ENVIRONMENTS = 2**20
 """Largest batch."""
 
 START_SETTINGS = ("horizon", "command", "initial", "action_delay", "delay", "mixed_delay")
 """Beginnings of the names of those fields of TaskConfig that the start of an episode depends on."""
-
-Policy = Callable[[Any, jax.Array, Descriptions, Observation], tuple[jax.Array, Any]]
-"""(params, key, descriptions[N], observation[N]) -> (action[N, J], extra pytree[N])."""
-
-
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True)
-class Trajectory:
-    """T control steps of N environments.
-
-    A design is fixed for an episode, so a rollout holds few of them. `descriptions` keeps
-    two per environment, the one at the start of the rollout and the one at its end, and
-    `slot` says which applies in each step. Steps of an episode that began and ended within
-    the rollout have neither; `valid` is 0 there.
-    """
-
-    observation: Observation  # [T, N, ...]
-    action: jax.Array  # [T, N, J]
-    extra: Any  # [T, N, ...] what the policy returned beside the action
-    reward: jax.Array  # [T, N]
-    terminated: jax.Array  # [T, N] bool
-    truncated: jax.Array  # [T, N] bool
-    finite: jax.Array  # [T, N] bool
-    slot: jax.Array  # [T, N] int32, 0 or 1
-    valid: jax.Array  # [T, N] float32
-    descriptions: Descriptions  # [2, N, ...]
-    last_observation: Observation  # [N, ...] after the last step
-    episode_return: jax.Array  # [T, N] return so far, episode_length likewise
-    episode_length: jax.Array
-    episode_error: jax.Array  # [T, N] mean over time and axes of |v_xy - c_xy| so far, m/s,
-    # each term at most twice the command limit
-    coefficient: jax.Array  # [T, N] curriculum coefficient
-
-
-class StepRecord(NamedTuple):
-    """What one control step adds to a trajectory."""
-
-    observation: Observation
-    action: jax.Array
-    extra: Any
-    reward: jax.Array
-    terminated: jax.Array
-    truncated: jax.Array
-    finite: jax.Array
-    episode_return: jax.Array
-    episode_length: jax.Array
-    episode_error: jax.Array
-    coefficient: jax.Array
-
-
-class _Group:
-    """The environments of one robot: a slice of the batch with its own physics."""
-
-    def __init__(self, robot: Robot, sizes: Sizes, first: int, count: int, config, design_dim):
-        self.robot, self.first, self.count = robot, first, count
-        self.slice = slice(first, first + count)
-        self.space = DesignSpace(robot)
-        self.read = reader(robot, sizes)
-        self.start = jax.vmap(
-            _starter(robot, self.space, sizes, config, design_dim), in_axes=(0, 0, 0, 0)
-        )
-        self.jitted_start = jax.jit(self.start)
-        self.qvel_index = np.asarray(robot.qvel_index)
-
-
-def _starter(robot: Robot, space: DesignSpace, sizes: Sizes, config: TaskConfig, design_dim: int):
-    """(key, design[d], coefficient, streak) -> (Episode, Embodiment, qpos, qvel)."""
-    to_descriptions, forward = describe(robot, sizes), kinematics(robot)
-    home = jnp.asarray(robot.home, jnp.float32)
-    site_quat = jnp.asarray(robot.model.site_quat[robot.imu_site], jnp.float32)
-    qpos_index = np.asarray(robot.qpos_index)
-
-    def start(key, design, coefficient, streak):
-        embodiment = space(design)
-        d = to_descriptions(embodiment)
-        pose_key, episode_key = jax.random.split(key)
-        quat, joints = randomization.initial_pose(config, pose_key, d, coefficient)
-        qpos = home.at[:2].set(0.0).at[2].set(d.home_height).at[3:7].set(quat)
-        qpos = qpos.at[qpos_index].set(joints[: robot.num_actuators])
-        # Put the centre of the lowest foot at floor height, as at the nominal pose.
-        frames = forward(embodiment, qpos)
-        lift = -jnp.min(frames.geom_pos[np.asarray(robot.feet), 2])
-        qpos = qpos.at[2].add(lift)
-        rise = jnp.array([0.0, 0.0, 1.0]) * lift
-
-        def padded(x, length):
-            return jnp.pad(x, [(0, length - x.shape[0])] + [(0, 0)] * (x.ndim - 1))
-
-        feet, spheres = np.asarray(robot.feet), np.asarray(robot.spheres)
-        readings = Readings(
-            joint_position=joints,
-            joint_velocity=jnp.zeros(sizes.joints),
-            joint_torque=jnp.zeros(sizes.joints),
-            trunk_velocity=jnp.zeros(6),
-            angular_velocity=jnp.zeros(3),
-            linear_velocity=jnp.zeros(3),
-            imu_height=frames.site_pos[robot.imu_site, 2] + lift,
-            imu_quat=quaternion_product(quat, site_quat),
-            foot_position=padded(frames.geom_pos[feet] + rise, sizes.feet),
-            foot_down=padded(frames.geom_rot[feet, 2], sizes.feet),
-            foot_velocity=jnp.zeros((sizes.feet, 3)),
-            sphere_position=padded(frames.geom_pos[spheres] + rise, sizes.spheres),
-            finite=jnp.asarray(True),
-        )
-        stored = jnp.pad(design, (0, design_dim - space.dim))
-        state = episodes.start(config, episode_key, stored, d, readings, coefficient, streak)
-        return state, embodiment, qpos, jnp.zeros(robot.model.nv)
-
-    return start
 
 
 class Locomotion:
@@ -197,7 +81,7 @@ class Locomotion:
     ):
         several = isinstance(robots, list | tuple)
         robots = [require_robot(robot) for robot in (robots if several else [robots])]
-        require_engine("engine", engine)
+        engine = resolved(engine)
         if not robots:
             raise ValueError("robots is empty; expected at least one robot")
         num_envs = require_integer("num_envs", num_envs, 1, MOST_ENVIRONMENTS)
@@ -211,55 +95,39 @@ class Locomotion:
         require_integer("threads", threads, 0, 4096)
         options = {} if physics_options is None else physics_options
         require_kind("physics_options", options, dict, "of arguments of the engine, by name")
-        if engine == "auto":
-            engine = "native" if jax.default_backend() == "cpu" else "mjx"
         self.robots, self.num_envs, self.engine = tuple(robots), num_envs, engine
-        self.config, self.sizes = config, sizes
-        self.auto_reset = auto_reset
+        self.sizes = sizes
         self.design_dim = max(robot.design_dim for robot in robots)
+        simulate = simulator(engine, threads, options)
         bounds = np.linspace(0, num_envs, len(robots) + 1).astype(int)
-        self.groups = [
-            _Group(robot, self.sizes, first, last - first, self.config, self.design_dim)
-            for robot, first, last in zip(robots, bounds[:-1], bounds[1:], strict=True)
-        ]
-        if engine == "native":
-            from shapebody.physics.native import NativePhysics
-
-            _require_options(options, NativePhysics)
-            for group in self.groups:
-                group.physics = NativePhysics(group.robot, group.count, threads=threads, **options)
-        else:
-            from shapebody.physics.mjx import MjxPhysics
-
-            _require_options(options, MjxPhysics)
-            for group in self.groups:
-                group.physics = MjxPhysics(group.robot, group.count, **options)
-        self._account = jax.jit(self._moving_part)
-        self._steps: dict[Any, Callable] = {}
+        groups = []
+        for robot, first, count in zip(robots, bounds, np.diff(bounds), strict=False):
+            physics = simulate(robot, count)
+            groups.append(RobotGroup(robot, physics, sizes, first, count, config, self.design_dim))
         self.physics_state = None
+        self._take(Batch(config, tuple(groups), auto_reset))
 
-    # ------------------------------------------------------------------ task, pure
+    def _take(self, batch: Batch) -> None:
+        """Work on `batch`. Its functions are compiled when they are first called."""
+        self.batch = batch
+        self._observe = jax.jit(batch.observe)
+        self._account = native_rollout.compiled_account(batch)
+        self._of_policy: dict[Any, Callable] = {}
 
-    def _observe(self, state: Episode):
-        return jax.vmap(partial(episodes.observe, self.config))(state)
+    @property
+    def config(self) -> TaskConfig:
+        """The task's settings."""
+        return self.batch.config
 
-    def _control(self, state: Episode, action):
-        return jax.vmap(partial(episodes.control, self.config))(state, action)
+    @property
+    def groups(self) -> tuple[RobotGroup, ...]:
+        """The environments of each robot, with its physics."""
+        return self.batch.groups
 
-    def _advance(self, state: Episode, raw):
-        """raw: per group (qpos, qvel, sensordata, finite)."""
-        parts = [group.read(*out) for group, out in zip(self.groups, raw, strict=True)]
-        readings = jax.tree.map(lambda *x: jnp.concatenate(x), *parts)
-        state, outcome = jax.vmap(partial(episodes.advance, self.config))(state, readings)
-        coefficient, streak = jax.vmap(partial(episodes.next_coefficient, self.config))(
-            state, outcome.terminated
-        )
-        return state, outcome, (coefficient, streak, _next_key(state.key))
-
-    def _moving_part(self, state: Episode, raw):
-        """`_advance` without what an episode keeps: a compiled function would copy its results."""
-        state, *others = self._advance(state, raw)
-        return replace(state, design=None, descriptions=None), *others
+    @property
+    def auto_reset(self) -> bool:
+        """Whether a finished episode is followed by a new one."""
+        return self.batch.auto_reset
 
     # ------------------------------------------------------------------ reset
 
@@ -299,7 +167,7 @@ class Locomotion:
         streaks = jnp.zeros(n, jnp.int32)
         if designs is None:
             designs = np.asarray(
-                _draw_designs(keys, coefficients, self.design_dim, self.config.design_radius)
+                draw_designs(keys, coefficients, self.design_dim, self.config.design_radius)
             )
         else:
             designs = self._validated(designs, n)
@@ -307,14 +175,14 @@ class Locomotion:
         for group in self.groups:
             s = group.slice
             f = designs[s, : group.space.dim]
+            arguments = keys[s], f, coefficients[s], streaks[s]
             if self.engine == "native":
                 ids = np.arange(group.count)
-                states += self._begin(group, ids, keys[s], f, coefficients[s], streaks[s])
+                states += native_rollout.begin(self.config, group, ids, *arguments)
             else:
-                arguments = (keys[s], jnp.asarray(f), coefficients[s], streaks[s])
-                state, *physics = group.jitted_start(*arguments)
+                state, physics = mjx_rollout.begin(group, *arguments)
                 states.append(state)
-                physics_states.append(group.physics.init(*physics))
+                physics_states.append(physics)
         state = jax.tree.map(lambda *x: jnp.concatenate(x), *states)
         if spread:
             horizon = jax.random.randint(
@@ -338,7 +206,7 @@ class Locomotion:
                 f"designs have shape {designs.shape}; expected at least one row of "
                 f"[S, {group.space.dim}]"
             )
-        return self._bodies(group, designs)[0]
+        return group.bodies(designs)[0]
 
     def _validated(self, designs, count: int, rows=None):
         """Designs [count, D] of environments `rows` (all if not given), from as many or one [D].
@@ -355,30 +223,14 @@ class Locomotion:
         designs = np.broadcast_to(designs, (count, dim))
         rows = np.arange(count) if rows is None else rows
         for group in self.groups:
-            own = (rows >= group.first) & (rows < group.first + group.count)
+            own = group.owned(rows)
             try:
                 group.space.validate(designs[own, : group.space.dim])
             except ValueError as error:
                 raise ValueError(f"designs of robot {group.robot.name!r}: {error}") from error
         return designs
 
-    def _bodies(self, group, designs):
-        """Descriptions and embodiments of designs [S, d], as NumPy arrays.
-
-        They come from the function that starts episodes, in chunks of its size, so that nothing
-        is compiled for them and every bit is that of an episode.
-        """
-        designs = np.asarray(designs, np.float32)
-        keys = np.asarray(jax.random.split(jax.random.PRNGKey(0), RESET_SLOTS))
-        zeros = np.zeros(RESET_SLOTS, np.float32), np.zeros(RESET_SLOTS, np.int32)
-        parts = []
-        for at in range(0, len(designs), RESET_SLOTS):
-            rows = np.minimum(np.arange(at, at + RESET_SLOTS), len(designs) - 1)
-            state, embodiment, *_ = group.jitted_start(keys, designs[rows], *zeros)
-            parts.append(jax.tree.map(np.asarray, (state.descriptions, embodiment)))
-        return jax.tree.map(lambda *x: np.concatenate(x)[: len(designs)], *parts)
-
-    def with_task(self, config: TaskConfig) -> "Locomotion":
+    def with_task(self, config: TaskConfig) -> Locomotion:
         """The same environments with other settings of the task.
 
         They share physics and the compiled functions that start episodes: `reset` or `restore` one
@@ -396,34 +248,8 @@ class Locomotion:
                     "create another Locomotion"
                 )
         other = copy.copy(self)
-        other.config = config
-        other._account = jax.jit(other._moving_part)
-        other._steps = {}
+        other._take(replace(self.batch, config=config))
         return other
-
-    def _begin(self, group, ids, keys, designs, coefficients, streaks) -> list[Episode]:
-        """Native engine: start episodes in environments `ids` of a group, RESET_SLOTS at a
-        time, so that one compiled function serves any number of them. `designs` None draws them."""
-        states = []
-        keys, coefficients, streaks = (np.asarray(x) for x in (keys, coefficients, streaks))
-        for at in range(0, len(ids), RESET_SLOTS):
-            chosen = ids[at : at + RESET_SLOTS]
-            m = len(chosen)
-            # Unused slots repeat the first one.
-            rows = np.concatenate([np.arange(at, at + m), np.full(RESET_SLOTS - m, at)])
-            k, c = keys[rows], coefficients[rows]
-            if designs is None:
-                f = _draw_designs(k, c, group.space.dim, self.config.design_radius)
-            else:
-                f = designs[rows]
-            state, embodiment, qpos, qvel = group.jitted_start(k, f, c, streaks[rows])
-            state, embodiment, qpos, qvel = jax.tree.map(
-                lambda x, m=m: np.asarray(x)[:m], (state, embodiment, qpos, qvel)
-            )
-            group.physics.set_designs(chosen, embodiment)
-            group.physics.set_state(chosen, qpos, qvel)
-            states.append(state)
-        return states
 
     def restart(
         self, state: Episode, rows, keys: jax.Array, designs=None, coefficient=1.0, streak=0
@@ -466,19 +292,7 @@ class Locomotion:
             designs = self._validated(designs, len(rows), rows)
         coefficient = np.broadcast_to(np.asarray(coefficient, np.float32), rows.shape)
         streak = np.broadcast_to(np.asarray(streak, np.int32), rows.shape)
-        for group in self.groups:
-            own = (rows >= group.first) & (rows < group.first + group.count)
-            if not own.any():
-                continue
-            f = None if designs is None else designs[own, : group.space.dim]
-            ids = rows[own] - group.first
-            fresh = self._begin(group, ids, keys[own], f, coefficient[own], streak[own])
-            if len(fresh) > 1:
-                fresh = [jax.tree.map(lambda *x: np.concatenate(x), *fresh)]
-            state = jax.tree.map(
-                lambda old, new, at=rows[own]: _replaced(old, at, new), state, *fresh
-            )
-        return state
+        return native_rollout.restart(self.batch, state, rows, keys, designs, coefficient, streak)
 
     # ------------------------------------------------------------------ rollouts
 
@@ -501,146 +315,49 @@ class Locomotion:
         self._check_call(policy, state, key)
         require_integer("length", length, 1, 1_000_000)
         if self.engine == "mjx":
-            return self._rollout_mjx(policy, params, state, key, length)
-        first = state.descriptions
-        records = []
-        for step_key in _step_keys(key, length):
-            state, record, _ = self.step(policy, params, state, step_key)
-            records.append(record)
-        stacked = jax.tree.map(lambda *x: np.stack(x), *records)
-        return state, self._trajectory(stacked, first, state)
+            rollout = self._rollout(policy, length)
+            state, self.physics_state, trajectory = rollout(params, state, self.physics_state, key)
+            return state, trajectory
+        functions = self._act(policy), self._account, self._observe
+        return native_rollout.rollout(self.batch, *functions, params, state, key, length)
 
-    def step(self, policy: Policy, params, state: Episode, key, running=None):
-        """One control step with the native engine: (state, StepRecord of numpy arrays, Outcome).
+    def step(
+        self, policy: Policy, params, state: Episode, key: jax.Array, running=None
+    ) -> tuple[Episode, StepRecord, Outcome]:
+        """Native engine: one control step of `policy` in all environments.
 
-        Where `running` ([N] bool, all if None) is False the body is not simulated, which saves
-        time, and what is returned about that environment means nothing.
+        Args:
+            policy, params, state, key: as in `rollout`.
+            running: bool [N], None for all. Where it is False the body is not simulated, which
+                saves time, and what is returned about that environment means nothing.
+
+        Returns:
+            The new state, the StepRecord (NumPy arrays), and the Outcome.
         """
         self._check_call(policy, state, key)
         if running is not None:
             running = require_array("running", running, (self.num_envs,), kinds="b")
-        act = self._compiled(policy)
-        moved, targets, observation, action, extra = act(params, state, key)
-        target, trunk, velocity = map(np.asarray, targets)
-        design, descriptions = state.design, state.descriptions
-        state = replace(state, **moved)
-        raw = []
-        for group in self.groups:
-            physics, s, nu = group.physics, group.slice, group.robot.num_actuators
-            physics.qvel[:, :6] = trunk[s]
-            physics.qvel[:, group.qvel_index] = velocity[s, :nu]
-            qpos, qvel, sensordata, finite = physics.step(
-                target[s, :nu], running=None if running is None else running[s]
-            )
-            raw.append((_f32(qpos), _f32(qvel), _f32(sensordata), np.array(finite)))
-        state, outcome, following = self._account(state, tuple(raw))
-        state = replace(state, design=design, descriptions=descriptions)
-        record = _record(state, observation, action, extra, outcome)
-        record = jax.tree.map(np.asarray, record)
-        done = record.terminated | record.truncated
-        if self.auto_reset and done.any():
-            rows = np.flatnonzero(done)
-            coefficient, streak, keys = (np.asarray(x)[rows] for x in following)
-            state = self.restart(state, rows, keys, None, coefficient, streak)
-        return state, record, outcome
+        return native_rollout.control_step(
+            self.batch, self._act(policy), self._account, params, state, key, running
+        )
 
     def _check_call(self, policy, state, key) -> None:
         require_function("policy", policy)
         require_kind("state", state, Episode, "what reset, step or rollout returned")
         require_key("key", key)
 
-    def _compiled(self, policy: Policy):
-        if policy not in self._steps:
+    def _act(self, policy: Policy) -> Callable:
+        """Native engine: the compiled function that belongs to a policy."""
+        if policy not in self._of_policy:
+            self._of_policy[policy] = native_rollout.compiled_act(self.batch, policy)
+        return self._of_policy[policy]
 
-            def act(params, state, key):
-                state, observation = self._observe(state)
-                action, extra = policy(params, key, state.descriptions, observation)
-                state, *targets = self._control(state, action)
-                moved = {"clock": state.clock, "actions": state.actions}
-                return moved, targets, observation, action, extra
-
-            self._steps[policy] = jax.jit(act)
-        return self._steps[policy]
-
-    def _trajectory(self, steps: StepRecord, first: Descriptions, state: Episode) -> Trajectory:
-        xp = np if isinstance(steps.reward, np.ndarray) else jnp
-        done = steps.terminated | steps.truncated
-        if not self.auto_reset:
-            done = xp.zeros_like(done)
-        # Episode number of each step within this rollout, and of the state after it.
-        number = xp.cumsum(done, 0) - done
-        final = xp.sum(done, 0)
-        slot = ((number == final) & (final > 0)).astype(np.int32)
-        valid = ((number == 0) | (number == final)).astype(np.float32)
-        _, last_observation = self._observe_jit(state)
-        descriptions = jax.tree.map(lambda a, b: jnp.stack([a, b]), first, state.descriptions)
-        return Trajectory(
-            **steps._asdict(),
-            slot=slot,
-            valid=valid,
-            descriptions=descriptions,
-            last_observation=last_observation,
-        )
-
-    @property
-    def _observe_jit(self):
-        if "observe" not in self._steps:
-            self._steps["observe"] = jax.jit(self._observe)
-        return self._steps["observe"]
-
-    def _rollout_mjx(self, policy, params, state, key, length):
-        name = (policy, length)
-        if name not in self._steps:
-            self._steps[name] = jax.jit(partial(self._scan, policy, length))
-        state, self.physics_state, trajectory = self._steps[name](
-            params, state, self.physics_state, key
-        )
-        return state, trajectory
-
-    def _scan(self, policy, length, params, state, physics, key):
-        first = state.descriptions
-
-        def control_step(carry, key):
-            state, physics = carry
-            state, observation = self._observe(state)
-            action, extra = policy(params, key, state.descriptions, observation)
-            state, target, trunk, velocity = self._control(state, action)
-            stepped, raw = [], []
-            for group, one in zip(self.groups, physics, strict=True):
-                s, nu = group.slice, group.robot.num_actuators
-                qvel = group.physics.velocity(one).at[:, :6].set(trunk[s])
-                qvel = qvel.at[:, group.qvel_index].set(velocity[s, :nu])
-                one = group.physics.with_velocity(one, qvel)
-                one, *out = group.physics.step(one, target[s, :nu])
-                stepped.append(one)
-                raw.append(tuple(out))
-            state, outcome, following = self._advance(state, tuple(raw))
-            record = _record(state, observation, action, extra, outcome)
-            if self.auto_reset:
-                done = outcome.terminated | outcome.truncated
-                state, stepped = self._restart_mjx(state, stepped, done, following)
-            return (state, tuple(stepped)), record
-
-        keys = jax.random.split(key, length)
-        (state, physics), records = jax.lax.scan(control_step, (state, physics), keys)
-        return state, physics, self._trajectory(records, first, state)
-
-    def _restart_mjx(self, state, physics, done, following):
-        coefficient, streak, keys = following
-        fresh, restarted = [], []
-        for group, one in zip(self.groups, physics, strict=True):
-            s = group.slice
-            radius = self.config.design_radius
-            designs = _draw_designs(keys[s], coefficient[s], group.space.dim, radius)
-            new, embodiment, qpos, qvel = group.start(keys[s], designs, coefficient[s], streak[s])
-            fresh.append(new)
-            restarted.append(group.physics.reset(one, done[s], embodiment, qpos, qvel))
-        fresh = jax.tree.map(lambda *x: jnp.concatenate(x), *fresh)
-
-        def choose(new, old):
-            return jnp.where(done.reshape(done.shape + (1,) * (old.ndim - 1)), new, old)
-
-        return jax.tree.map(choose, fresh, state), restarted
+    def _rollout(self, policy: Policy, length: int) -> Callable:
+        """MJX: the compiled function that belongs to a policy and a number of steps."""
+        if (policy, length) not in self._of_policy:
+            compiled = mjx_rollout.compiled_rollout(self.batch, policy, length)
+            self._of_policy[policy, length] = compiled
+        return self._of_policy[policy, length]
 
     # ------------------------------------------------------------------ exact resume
 
@@ -661,66 +378,6 @@ class Locomotion:
             require_kind("an entry of arrays", saved, dict, "what physics_arrays returned")
         designs = np.asarray(state.design)
         for group, saved in zip(self.groups, arrays, strict=True):
-            _, embodiments = self._bodies(group, designs[group.slice, : group.space.dim])
+            _, embodiments = group.bodies(designs[group.slice, : group.space.dim])
             group.physics.set_designs(np.arange(group.count), embodiments)
             group.physics.restore(saved)
-
-
-def _require_options(options: dict, engine) -> None:
-    """ValueError if an engine's constructor does not take these."""
-    given = ("robot", "num_envs", "threads")
-    known = [name for name in inspect.signature(engine).parameters if name not in given]
-    for name in options:
-        if name not in known:
-            raise refuse("a key of physics_options", name, f"one of {', '.join(known)}")
-
-
-def _record(state: Episode, observation, action, extra, outcome: Outcome) -> StepRecord:
-    return StepRecord(
-        observation=observation,
-        action=action,
-        extra=extra,
-        reward=outcome.reward,
-        terminated=outcome.terminated,
-        truncated=outcome.truncated,
-        finite=outcome.finite,
-        episode_return=state.total_reward,
-        episode_length=state.step,
-        episode_error=state.total_error / jnp.maximum(state.step, 1),
-        coefficient=state.coefficient,
-    )
-
-
-def _f32(x):
-    return np.asarray(x, np.float32)
-
-
-def _replaced(old, rows, new):
-    result = np.array(old)
-    result[rows] = new
-    return result
-
-
-@partial(jax.jit, static_argnums=1)
-def _step_keys(key, length: int):
-    """A key for each step of a rollout."""
-    return jax.vmap(lambda t: jax.random.fold_in(key, t))(jnp.arange(length))
-
-
-@jax.jit
-def _next_key(keys):
-    """Each environment's key for its next episode, from its key for this one."""
-    return jax.vmap(lambda key: jax.random.fold_in(key, 2**31 - 1))(keys)
-
-
-@partial(jax.jit, static_argnums=(2, 3))
-def _draw_designs(keys, coefficients, dim: int, radius: tuple[float, float]):
-    """f ~ U([-rc, rc]^d), one per key (Section 3.1), with r uniform between `radius`."""
-
-    def draw(key, c):
-        design = jax.random.uniform(jax.random.fold_in(key, 7), (dim,), minval=-1.0, maxval=1.0)
-        low, high = radius
-        r = jax.random.uniform(jax.random.fold_in(key, 8), minval=low, maxval=high)
-        return design * (c * r)
-
-    return jax.vmap(draw)(keys, coefficients)

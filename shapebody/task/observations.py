@@ -11,8 +11,9 @@ import jax
 import jax.numpy as jnp
 
 from shapebody.design.descriptions import Descriptions
+from shapebody.rotations import up_axis
 from shapebody.task.config import TaskConfig
-from shapebody.task.sensors import Readings, up_axis
+from shapebody.task.sensors import Readings
 
 
 @jax.tree_util.register_dataclass

@@ -3,10 +3,13 @@
 All functions treat one environment; `env` vmaps them.
 """
 
+from functools import partial
+
 import jax
 import jax.numpy as jnp
 
 from shapebody.design.descriptions import Descriptions
+from shapebody.rotations import quaternion_of_euler
 from shapebody.task.config import TaskConfig
 
 
@@ -39,7 +42,7 @@ def initial_pose(config: TaskConfig, key, descriptions: Descriptions, coefficien
     angle_key, factor_key, offset_key = jax.random.split(key, 3)
     widths = jnp.array([config.initial_tilt, config.initial_tilt, config.initial_yaw])
     angles = jax.random.uniform(angle_key, (3,), minval=-1.0, maxval=1.0)
-    quat = quat_from_euler(coefficient * widths * angles)
+    quat = quaternion_of_euler(coefficient * widths * angles)
     shape = descriptions.nominal.shape
     factor = jax.random.uniform(factor_key, shape, minval=-1.0, maxval=1.0)
     offset = jax.random.uniform(offset_key, shape, minval=-1.0, maxval=1.0)
@@ -81,15 +84,17 @@ def push(config: TaskConfig, key, trunk_velocity, total_mass, coefficient):
     return jnp.where(happens, pushed, trunk_velocity)
 
 
-def quat_from_euler(angles):
-    """Quaternion (w, x, y, z) of rotations about the fixed x, then y, then z axes."""
-    cx, cy, cz = jnp.cos(angles / 2)
-    sx, sy, sz = jnp.sin(angles / 2)
-    return jnp.stack(
-        [
-            cx * cy * cz + sx * sy * sz,
-            sx * cy * cz - cx * sy * sz,
-            cx * sy * cz + sx * cy * sz,
-            cx * cy * sz - sx * sy * cz,
-        ]
-    )
+@partial(jax.jit, static_argnums=(2, 3))
+def draw_designs(keys, coefficients, dim: int, radius: tuple[float, float]):
+    """f ~ U([-rc, rc]^d) (Section 3.1), float32 [n, d], with r uniform between `radius`.
+
+    keys, coefficients: [n], one per design; dim: d.
+    """
+
+    def draw(key, c):
+        design = jax.random.uniform(jax.random.fold_in(key, 7), (dim,), minval=-1.0, maxval=1.0)
+        low, high = radius
+        r = jax.random.uniform(jax.random.fold_in(key, 8), minval=low, maxval=high)
+        return design * (c * r)
+
+    return jax.vmap(draw)(keys, coefficients)

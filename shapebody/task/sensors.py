@@ -8,6 +8,7 @@ import numpy as np
 
 from shapebody.design.descriptions import Sizes
 from shapebody.robot.robot import Robot
+from shapebody.rotations import up_axis
 
 
 @jax.tree_util.register_dataclass
@@ -68,12 +69,6 @@ def reader(robot: Robot, sizes: Sizes):
         )
 
     return read
-
-
-def up_axis(quat):
-    """The world's z axis in the frame of a quaternion (w, x, y, z): [..., 4] -> [..., 3]."""
-    w, x, y, z = quat[..., 0], quat[..., 1], quat[..., 2], quat[..., 3]
-    return jnp.stack([2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)], -1)
 
 
 def _picker(index: np.ndarray):
