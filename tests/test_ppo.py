@@ -125,7 +125,7 @@ def test_configurations_without_sense(name, value):
 def test_configurations_of_wrong_kinds(name, value):
     with pytest.raises((TypeError, ValueError), match=f"{name} is .*; expected"):
         training_config.TrainConfig.reduced("unitree_go2", **{name: value})
-    with pytest.raises(ValueError, match="scale is 'huge'; expected one of smoke, reduced, full"):
+    with pytest.raises(ValueError, match="scale is 'huge'; expected .*smoke"):
         training_config.TrainConfig.reduced("unitree_go2", scale="huge")
 
 
