@@ -133,9 +133,6 @@ UNCHECKED = {
     "optimizers.loop.Search": RESULT,
     "optimizers.loop.Steps": "a method of one's own: what it does is up to its functions",
     "optimizers.loop.last_finite": METHOD,
-    "optimizers.loop.require": "a check itself, called by the methods' configurations",
-    "optimizers.loop.require_integers": "a check itself, called by the methods' configurations",
-    "optimizers.loop.require_positive": "a check itself, called by the methods' configurations",
     "optimizers.loop.score": METHOD,
     "optimizers.loop.start_key": METHOD,
     "optimizers.loop.values_and_gradients": METHOD,
@@ -421,7 +418,7 @@ FUNCTIONS = {
         episodes=optional(integer(1, 10**6)),
         seed=SEED,
         engine=ENGINE,
-        config=optional(config("evaluation", "EvaluationConfig")),
+        config=optional(config("evaluation.evaluate", "EvaluationConfig")),
         progress=FLAG,
     ),
     "evaluation.statistics.paired_gain": dict(
@@ -597,7 +594,7 @@ FUNCTIONS = {
     "task.rewards.combine": dict(
         terms=array(23), coefficient=PROBABILITY.also(*WRONG, why=FORMULA)
     ),
-    "networks.critic.Critic": dict(config=config("networks", "CriticConfig")),
+    "networks.critic.Critic": dict(config=config("networks.config", "CriticConfig")),
     "networks.config.CriticConfig": dict(
         kind=choice("original"),
         heads=WIDTH_1,
@@ -611,7 +608,7 @@ FUNCTIONS = {
     "networks.config.CriticConfig.original": {},
     "networks.config.CriticConfig.reduced": {},
     "networks.config.CriticConfig.sharp": {},
-    "networks.policy.Policy": dict(config=config("networks", "PolicyConfig")),
+    "networks.policy.Policy": dict(config=config("networks.config", "PolicyConfig")),
     "networks.config.PolicyConfig": dict(
         key_widths=WIDTHS,
         value_latent=WIDTH_1,
@@ -756,8 +753,8 @@ FUNCTIONS = {
         ),
         scale=choice("smoke"),
         seed=SEED,
-        policy=config("networks", "PolicyConfig"),
-        critic=config("networks", "CriticConfig"),
+        policy=config("networks.config", "PolicyConfig"),
+        critic=config("networks.config", "CriticConfig"),
         standardize=FLAG,
         num_envs=integer(1, 2**24, 4096),
         rollout_length=integer(2**14, 2**24, 64),
@@ -853,7 +850,7 @@ FUNCTIONS = {
     ),
     "training.policy_evaluation.train_critic": dict(
         agent=AGENT,
-        critic=config("networks", "CriticConfig"),
+        critic=config("networks.config", "CriticConfig"),
         steps=optional(STEPS),
         task_of=choice("training"),
         **RESUMED,
@@ -935,7 +932,7 @@ FUNCTIONS = {
     "optimizers.objective.Objective.value": dict(designs=DESIGN, states=STATES),
     "optimizers.state_bank.bank": dict(agent=AGENT, robot=ROBOT),
     "optimizers.objective.design_critic": dict(
-        robot=ROBOT, config=config("networks", "CriticConfig")
+        robot=ROBOT, config=config("networks.config", "CriticConfig")
     ),
     "optimizers.state_bank.trim": dict(states=thing(lambda world: world.agent.states), robot=ROBOT),
     "optimizers.gc_pfo.GCPFOConfig": dict(

@@ -17,6 +17,7 @@ from tiny import quick_compilation
 
 import shapebody
 from shapebody import arguments as _arguments
+from shapebody import files
 
 PACKAGE = Path(shapebody.__file__).parent
 
@@ -96,7 +97,7 @@ def test_a_function_without_an_entry_is_noticed(monkeypatch):
 
     fresh.__module__ = paper.__name__
     monkeypatch.setattr(paper, "fresh", fresh, raising=False)
-    assert "paper.fresh" in public() and not known("paper.fresh", None)
+    assert "reproduction.paper.fresh" in public() and not known("reproduction.paper.fresh", None)
 
 
 @pytest.mark.parametrize("path", FUNCTIONS)
@@ -330,7 +331,7 @@ import shapebody
 from shapebody import runtime
 from shapebody import notebooks
 assert runtime.enable_compilation_cache() is None
-assert len(shapebody.robot.robot()) == 50
+assert len(shapebody.robots()) == 50
 for call in (shapebody.load_robot, shapebody.load_agent):
     try:
         call("~/x.xml")
@@ -364,8 +365,8 @@ WRITERS = {
     "save_agent": lambda world, path: shapebody.save_agent(world.agent, path),
     "Report.write": lambda world, path: world.report.write(path),
     "Scene.save": lambda world, path: world.scene.save(path),
-    "save_arrays": lambda world, path: shapebody.checkpoints.save_arrays(path, {"a": 1.0}),
-    "atomic_write": lambda world, path: shapebody.checkpoints.atomic_write(path, "text"),
+    "save_arrays": lambda world, path: files.save_arrays(path, {"a": 1.0}),
+    "atomic_write": lambda world, path: files.atomic_write(path, "text"),
 }
 
 
