@@ -20,7 +20,10 @@ def cache_folder() -> Path:
     chosen = os.environ.get("JAX_COMPILATION_CACHE_DIR")
     if chosen:
         return Path(chosen).expanduser()
-    return platformdirs.user_cache_path("shapebody", appauthor=False) / "jax" / _processor()
+    folder = platformdirs.user_cache_path("shapebody", appauthor=False)
+    if not folder.is_absolute():
+        raise RuntimeError("the user's home folder is unknown; set HOME")
+    return folder / "jax" / _processor()
 
 
 def _processor() -> str:

@@ -256,7 +256,9 @@ PLAYED = dict(frames=FRAMES, fps=FPS)
 WIDTH = optional(integer(1, 100_000))
 NAMES = optional(thing(lambda world: ["unitree_go2"]))
 SECONDS = optional(number(0))
-RESUMED = dict(folder=optional(FOLDER), progress=FLAG, max_seconds=SECONDS, engine=ENGINE)
+CALL = dict(progress=FLAG, max_seconds=SECONDS, engine=ENGINE)
+RESUMED = dict(folder=optional(FOLDER), **CALL)
+RUN = NAME
 CRITICS = thing(lambda world: {"a": world.agent})
 STATES = optional(thing(lambda world: world.agent.states))
 STATE = thing(lambda world: world.state)
@@ -810,25 +812,18 @@ FUNCTIONS = {
         discount=PROBABILITY.also(*WRONG, why=FORMULA),
         gae_lambda=PROBABILITY.also(*WRONG, why=FORMULA),
     ),
-    "training.train.anneal": RESUMED
-    | dict(
-        name=NAME,
-        steps=STEPS,
-        last_rate=AT_LEAST_0,
-        replace=FLAG,
-        folder=optional(FOLDER).given(None),
-    ),
+    "training.train.anneal": CALL
+    | dict(name_or_folder=RUN, steps=STEPS, last_rate=AT_LEAST_0, replace=FLAG),
     "training.rollout.make_policy_function": dict(
         policy=thing(lambda world: world.agent.policy_module), mean_actions=FLAG
     ),
-    "training.train.continue_run": RESUMED
+    "training.train.continue_run": CALL
     | dict(
-        name=NAME,
+        name_or_folder=RUN,
         overrides=optional(thing(lambda world: {})).also("dictionary", why="no overrides"),
         max_steps=optional(STEPS),
         state_only=FLAG,
         replace=FLAG,
-        folder=optional(FOLDER).given(None),
     ),
     "training.update.init_learner": dict(
         config=thing(lambda world: world.train_config),

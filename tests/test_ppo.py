@@ -277,7 +277,7 @@ def test_a_run_keeps_its_engine(config, straight, tmp_path, monkeypatch):
     with pytest.raises(ValueError, match="engine is 'mjx', but the run in .* with 'native'"):
         training_trainer.Trainer(config, straight[0], "mjx")
     with pytest.raises(ValueError, match="engine is 'mjx'"):
-        train.anneal(config.name, folder=straight[0], engine="mjx")
+        train.anneal(straight[0], engine="mjx")
     assert run_state.run_engine(tmp_path, "mjx") == "mjx"
     (tmp_path / "training.safetensors").touch()
     for phases, own in [("[{}]", "native"), ('[{"engine": "mjx"}, {}]', "mjx"), ("{", "auto")]:
@@ -322,11 +322,11 @@ def test_a_run_continues_only_with_its_own_configuration(config, tmp_path):
 def test_a_run_goes_on_with_what_it_has(config, tmp_path):
     """Whatever the defaults are now; settings are overridden by name, and that is recorded."""
     config = replace(config, num_envs=8, minibatch_size=32, epochs=1, name="walker")
-    arguments = dict(folder=tmp_path, progress=False, state_only=True)
+    arguments = dict(progress=False, state_only=True)
     with pytest.raises(FileNotFoundError, match="there is no run in .*training.safetensors"):
-        train.continue_run("walker", **arguments)
-    train.train(config, max_steps=64, **arguments)
-    train.continue_run("walker", max_steps=128, **arguments)
+        train.continue_run(tmp_path, **arguments)
+    train.train(config, tmp_path, max_steps=64, **arguments)
+    train.continue_run(tmp_path, max_steps=128, **arguments)
     path = tmp_path / "training.json"
     assert [phase["from_step"] for phase in json.loads(path.read_text())] == [0]
     for overrides, message in (
@@ -336,14 +336,14 @@ def test_a_run_goes_on_with_what_it_has(config, tmp_path):
         (dict(policy=replace(config.policy, core_widths=(12, 8))), "does not fit the state"),
     ):
         with pytest.raises(ValueError, match=message):
-            train.continue_run("walker", overrides, **arguments)
+            train.continue_run(tmp_path, overrides, **arguments)
     # The limits of the noise and the lengths of episodes fit any state.
     overrides = dict(
         policy=replace(config.policy, std_limits=(0.05, 2.0)),
         task=replace(config.task, horizon=6, curriculum_length=3),
         learning_rate=(1e-4, 1e-4),
     )
-    train.continue_run("walker", overrides, max_steps=320, **arguments)
+    train.continue_run(tmp_path, overrides, max_steps=320, **arguments)
     phases = json.loads(path.read_text())
     assert [phase["from_step"] for phase in phases] == [0, 128]
     assert phases[1]["config"]["learning_rate"] == [1e-4, 1e-4]
@@ -352,8 +352,8 @@ def test_a_run_goes_on_with_what_it_has(config, tmp_path):
     trainer = training_trainer.Trainer(changed, tmp_path)
     assert trainer.start() and 6 in np.asarray(trainer.actor.state.horizon)
     with pytest.raises(ValueError, match="learning_rate was .*; policy.std_limits was|policy.std"):
-        train.train(config, **arguments)
-    train.train(changed, max_steps=384, **arguments)
+        train.train(config, tmp_path, **arguments)
+    train.train(changed, tmp_path, max_steps=384, **arguments)
     assert json.loads(path.read_text()) == phases
 
 
@@ -392,7 +392,7 @@ def test_two_runs_in_one_folder(config, tmp_path):
 def test_annealing_leaves_the_run_as_it_is(config, tmp_path, monkeypatch):
     config = replace(config, num_envs=8, minibatch_size=32, epochs=1, name="walker")
     with pytest.raises(ValueError, match="training.safetensors is missing"):
-        train.anneal("walker", folder=tmp_path)
+        train.anneal(tmp_path)
     trainer = training_trainer.Trainer(config, tmp_path)
     trainer.start()
     trainer.run(max_steps=2 * config.batch, progress=False)
@@ -401,12 +401,12 @@ def test_annealing_leaves_the_run_as_it_is(config, tmp_path, monkeypatch):
 
     steps, last_rate = 3 * config.batch, 1e-6
     # A time limit stops it early; the same call goes on with what is left.
-    arguments = dict(steps=steps, last_rate=last_rate, folder=tmp_path, progress=False)
-    assert train.anneal("walker", max_seconds=0.0, **arguments) is None
+    arguments = dict(steps=steps, last_rate=last_rate, progress=False)
+    assert train.anneal(tmp_path, max_seconds=0.0, **arguments) is None
     with pytest.raises(ValueError, match="delete that folder to begin anew"):
-        train.anneal("walker", **arguments | {"steps": 2 * config.batch})
+        train.anneal(tmp_path, **arguments | {"steps": 2 * config.batch})
     assert not (tmp_path / "agent.json").exists()
-    agent = train.anneal("walker", **arguments)
+    agent = train.anneal(tmp_path, **arguments)
     assert agent.metadata["steps"] == 5 * config.batch
     assert load_agent(tmp_path).hash == agent.hash
     assert {file: (tmp_path / file).read_bytes() for file in run_state.STATE_FILES} == before
@@ -418,20 +418,20 @@ def test_annealing_leaves_the_run_as_it_is(config, tmp_path, monkeypatch):
     rows = load_curve(tmp_path)
     assert rows["steps"][-1] == 5 * config.batch
     with pytest.raises(ValueError, match="agent .* has 320 steps, the run that would .* it 192"):
-        train.anneal("walker", **arguments | {"steps": config.batch})
+        train.anneal(tmp_path, **arguments | {"steps": config.batch})
     with pytest.raises(ValueError, match="last_rate is 0.01, above the present rate"):
-        train.anneal("walker", **arguments | {"last_rate": 1e-2})
+        train.anneal(tmp_path, **arguments | {"last_rate": 1e-2})
     for steps in (0, -5, 1.5):
         with pytest.raises(ValueError, match=f"steps is {steps}; expected an integer of at least"):
-            train.anneal("walker", **arguments | {"steps": steps})
+            train.anneal(tmp_path, **arguments | {"steps": steps})
     document = json.loads((tmp_path / "agent.json").read_text())
     document["metadata"]["policy_evaluation"] = {}
     (tmp_path / "agent.json").write_text(json.dumps(document))
     with pytest.raises(ValueError, match="critic from policy evaluation"):
-        train.anneal("walker", **arguments | {"steps": 9 * config.batch})
+        train.anneal(tmp_path, **arguments | {"steps": 9 * config.batch})
     assert not (tmp_path / "annealed").exists() and load_agent(tmp_path).hash == agent.hash
     arguments |= {"steps": 2 * config.batch, "replace": True}
-    assert train.anneal("walker", max_seconds=0.0, **arguments) is None
+    assert train.anneal(tmp_path, max_seconds=0.0, **arguments) is None
     assert (tmp_path / "annealed" / "training.safetensors").exists()
 
 

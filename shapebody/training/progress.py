@@ -32,7 +32,8 @@ CURVE_INTERVAL = 10
 def read_rows(path: Path) -> tuple[list[dict[str, str]], bool]:
     """The rows of a learning curve as text, and whether others in the file are damaged.
 
-    A last row that a killed run left unfinished is left out and is no damage. No file, no rows.
+    A last row that a killed run left unfinished is left out and does not count as damage. Without
+    a file there are no rows.
     """
     if not path.exists():
         return [], False
@@ -155,7 +156,7 @@ class Curve:
 
 # ---------------------------------------------------------------------- the progress line
 
-COMPILATION = {"native": 60, "mjx": 180}
+COMPILATION = {"native": 50, "mjx": 180}
 """Seconds until the first iteration, on two CPU cores and nothing in the compilation cache; for the
 robots after the first, a quarter more each."""
 
@@ -174,7 +175,7 @@ class Progress:
     """The progress of one call: a line that is rewritten in a terminal or notebook.
 
     Where the output is neither, at most one line a minute is printed, and one at the end. Speed
-    and time left are reckoned from the second iteration on: the first one compiles.
+    and time left are measured from the second iteration on: the first one compiles.
 
     Args:
         last: environment steps at which the call ends.

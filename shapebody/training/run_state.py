@@ -15,6 +15,7 @@ than one where settings were overridden, or where the run is a copy that is anne
 phase also has the hashes of the robots' files and the name of the engine.
 """
 
+import os
 from collections.abc import Collection
 from dataclasses import replace
 from pathlib import Path
@@ -23,12 +24,14 @@ from typing import Annotated
 from pydantic import Field
 
 from shapebody.agent.description import Phase
+from shapebody.agent.store import chosen_folder
 from shapebody.arguments import (
     require_engine,
     require_flag,
     require_integer,
     require_kind,
     require_number,
+    require_path,
 )
 from shapebody.configuration import configuration, from_json, to_json
 from shapebody.stored import read_json, read_number
@@ -61,6 +64,18 @@ def require_budget(max_steps, max_seconds, progress) -> None:
 
 
 # ---------------------------------------------------------------------- reading
+
+
+def run_folder(name_or_folder: str | Path) -> Path:
+    """The folder of a run: data/checkpoints/<name>, or the folder that is given.
+
+    A Path, or a string with a path separator in it, is a folder; any other string is a name.
+    """
+    path = require_path("name_or_folder", name_or_folder)
+    text = str(name_or_folder)
+    if isinstance(name_or_folder, Path) or os.sep in text or "/" in text:
+        return path
+    return chosen_folder(None, text)
 
 
 def state_version(folder: Path):
@@ -123,7 +138,7 @@ def read_config(folder: Path) -> TrainConfig:
     """
     if not has_run(folder):
         raise FileNotFoundError(
-            f"there is no run in {folder}: {STATE} is missing; begin one with train.train"
+            f"there is no run in {folder}: {STATE} is missing; begin one with shapebody.train(...)"
         )
     try:
         return from_json(TrainConfig, read_phases(folder)[-1].get("config"), "config")
@@ -189,8 +204,8 @@ def continued_phases(
         text = "; ".join(_difference(name, before[name], now[name]) for name in other)
         raise ValueError(
             f"the run in {folder.name} has another configuration ({text}); continue it with its "
-            "own by train.continue_run, choose another name for this one, or delete "
-            f"{STATE} there to begin anew"
+            f"own (train.continue_run, python -m shapebody continue {folder.name}), choose another "
+            f"name for this one, or delete {STATE} there to begin anew"
         )
     require_same_robots(phases[0].get("robots", {}), robots, f"the run in {folder.name}")
     return phases + [{"from_step": steps, "config": now}] if different else phases

@@ -9,7 +9,7 @@ from collections.abc import Mapping
 from pathlib import Path
 
 from shapebody.agent.agent import Agent
-from shapebody.agent.store import chosen_folder, load_agent
+from shapebody.agent.store import load_agent
 from shapebody.arguments import (
     require_engine,
     require_flag,
@@ -35,6 +35,7 @@ from shapebody.training.run_state import (
     require_budget,
     require_run,
     run_engine,
+    run_folder,
 )
 from shapebody.training.trainer import Trainer
 
@@ -89,9 +90,8 @@ def train(
 
 
 def continue_run(
-    name: str,
+    name_or_folder: str | Path,
     overrides: Mapping | None = None,
-    folder=None,
     progress: bool = True,
     max_steps: int | None = None,
     max_seconds: float | None = None,
@@ -102,11 +102,11 @@ def continue_run(
     """Continue a run with the configuration that it has, whatever the defaults are now.
 
     Args:
-        name: of the run, which is in data/checkpoints/<name>.
+        name_or_folder: of the run. A Path, or a string with a path separator in it, is a folder;
+            any other string is a name in data/checkpoints.
         overrides: settings by name that the run has from here on, such as
-            `{"learning_rate": (3e-5, 3e-5)}`; training.json records them as a new phase. The file
-            of a robot that has moved is given as "robots".
-        folder: of the run, instead of data/checkpoints/<name>.
+            `{"learning_rate": (3e-5, 3e-5)}`; training.json records them as a new phase. A robot
+            whose file has moved is given as "robots".
         progress, max_steps, max_seconds, engine, state_only, replace: see `train`.
 
     Returns:
@@ -116,7 +116,7 @@ def continue_run(
         FileNotFoundError: if there is no such run.
         ValueError: as `train`, and if a setting cannot be overridden.
     """
-    folder = chosen_folder(folder, name)
+    folder = run_folder(name_or_folder)
     overrides = {} if overrides is None else overrides
     _require_overrides(overrides)
     _require_call(engine, progress, max_steps, max_seconds, state_only, replace)
@@ -199,10 +199,9 @@ def run_or_interrupt(trainer: Trainer, progress, max_steps=None, max_seconds=Non
 
 
 def anneal(
-    name: str,
+    name_or_folder: str | Path,
     steps: int = 1_640_000,
     last_rate: float = 2e-5,
-    folder=None,
     progress: bool = True,
     max_seconds: float | None = None,
     engine: str = "auto",
@@ -215,11 +214,10 @@ def anneal(
     agent is the copy's. The run itself stays where it is and can go on as fast as before.
 
     Args:
-        name: of the agent whose run is in data/checkpoints/<name>.
+        name_or_folder: of the run, as in `continue_run`. The agent is saved there, too; the copy
+            is in a folder in it until it is finished.
         steps: environment steps of the copy.
         last_rate: its learning rate at the end; linear from the run's present one.
-        folder: of the run, instead of data/checkpoints/<name>. The agent is saved there; the copy
-            is in a folder in it until it is finished.
         progress, max_seconds, engine: see `train`. A copy that was stopped is continued.
         replace: replace the agent in the folder even if it has more steps than the copy will have,
             or a critic from policy evaluation.
@@ -237,7 +235,7 @@ def anneal(
     require_engine("engine", engine)
     require_budget(None, max_seconds, progress)
     require_flag("replace", replace)
-    folder = chosen_folder(folder, name)
+    folder = run_folder(name_or_folder)
     copy = folder / "annealed"
     engine = run_engine(folder, engine)
     config = _begin_annealing(folder, copy, steps, last_rate, replace)
@@ -249,7 +247,8 @@ def anneal(
         if trainer.steps < config.iterations * config.batch:
             return None
         agent = trainer.save_agent(folder)
-        # By renaming it first: a copy of which a killed call has removed half would be no run.
+        # Renamed first: if this call is killed while it removes the copy, the rest of it must not
+        # look like a copy that can be continued.
         finished = folder / f".annealed.{secrets.token_hex(4)}.tmp"
         os.replace(copy, finished)
     for leftover in folder.glob(".annealed.*.tmp"):
@@ -266,7 +265,7 @@ def _begin_annealing(
     """
     missing = [file for file in STATE_FILES if not (folder / file).exists()]
     if missing:
-        raise ValueError(f"there is no run to anneal in {folder.name}: {missing[0]} is missing")
+        raise ValueError(f"there is no run to anneal in {folder}: {missing[0]} is missing")
     # The state is read first: curve rows that are newer than it do no harm.
     state = (folder / STATE).read_bytes()
     done, phases = finished_iterations(folder), read_phases(folder)
