@@ -1,11 +1,10 @@
-"""Where the shipped data lives."""
+"""Files of this package: where they are, locks, and writing them whole or not at all."""
 
 from __future__ import annotations
 
 import contextlib
 import csv
 import errno
-import fcntl
 import io
 import os
 import re
@@ -13,18 +12,19 @@ import secrets
 import shutil
 import signal
 import threading
-import time
 import zlib
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
+import filelock
 import jax
 import jax.numpy as jnp
 import numpy as np
 import safetensors.numpy
 
 from shapebody.arguments import require_folder, require_kind, require_output, require_path
-from shapebody.stored import read_metadata, read_safetensors, read_text
+from shapebody.stored import read_metadata, read_safetensors, read_text, require_arrays
 
 
 def data_dir() -> Path:
@@ -117,50 +117,60 @@ def _remove_leftovers(path: Path) -> None:
 
 
 def _lock(handle: int) -> bool:
-    """Lock an open file or folder; False if somebody else has, or if it cannot be told."""
+    """Lock an open file; False if somebody else has, or if that cannot be told."""
     try:
-        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        return filelock.lock_descriptor(handle, blocking=False)
     except OSError:
         return False
-    return True
 
 
 @contextlib.contextmanager
-def locked(path: Path, patience: float = 60.0):
-    """Keep all other blocks like this for the same path waiting, in all processes.
+def locked(path: Path, patience: float = 60.0, busy: str = ""):
+    """Keep all other blocks like this for the same path waiting, in all threads and processes.
 
-    For short work such as reading, merging and writing one file. The operating system forgets the
-    lock when the process ends, however it ends.
+    The operating system forgets the lock when the process ends, however it ends.
 
-    Raises ValueError if the others have not finished after `patience` seconds.
+    Args:
+        path: what the block works on; it need not exist.
+        patience: seconds to wait for another block.
+        busy: the error's text, if not that of a file that is being written.
+
+    Raises:
+        ValueError: if the others have not finished after `patience` seconds.
     """
-    path.parent.mkdir(parents=True, exist_ok=True)
     lock = path.with_name(f".{path.name[:100]}.lock.tmp")
-    until = time.monotonic() + patience
-    while True:
-        handle = os.open(lock, os.O_RDWR | os.O_CREAT, 0o666)
-        try:
-            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            # Whoever had it before may have removed the file.
-            with contextlib.suppress(FileNotFoundError):
-                if os.path.samestat(os.fstat(handle), os.stat(lock)):
-                    break
-        except BlockingIOError:
-            if time.monotonic() > until:
-                os.close(handle)
-                raise ValueError(
-                    f"another process has been writing {path} for {patience:.0f} s; wait for it, "
-                    "or stop it"
-                ) from None
-            time.sleep(0.01)
-        except OSError:  # a file system without locks
-            break
-        os.close(handle)
+    holder = filelock.FileLock(lock, timeout=patience, poll_interval=0.01)
+    try:
+        holder.acquire()
+    except filelock.Timeout:
+        raise ValueError(
+            busy
+            or f"another process has been writing {path} for {patience:.0f} s; wait for it, or "
+            "stop it"
+        ) from None
     try:
         yield
     finally:
-        lock.unlink(missing_ok=True)
-        os.close(handle)
+        # While it is locked: who waits for a file that is removed looks for the next one.
+        with contextlib.suppress(OSError):
+            lock.unlink()
+        holder.release()
+
+
+@contextlib.contextmanager
+def alone_in(folder: str | Path):
+    """Keep other processes, and other blocks like this, out of a folder while the block runs.
+
+    Raises:
+        ValueError: if the folder is taken.
+    """
+    folder = require_folder("folder", folder)
+    busy = (
+        f"another training run is at work in {folder}; wait for it, stop it, or choose another "
+        "name or folder"
+    )
+    with locked(folder / "training", 0.0, busy):
+        yield
 
 
 PENDING = ".agent.new"
@@ -253,27 +263,16 @@ def _uninterrupted():
         signal.raise_signal(signal.SIGINT)
 
 
-@contextlib.contextmanager
-def alone_in(folder: str | Path):
-    """Keep other processes, and other blocks like this, out of a folder while the block runs.
-
-    The operating system forgets the lock when the process ends, however it ends.
-
-    Raises:
-        ValueError: if the folder is taken.
-    """
-    handle = os.open(require_folder("folder", folder), os.O_RDONLY)
-    try:
-        try:
-            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError as error:
-            raise ValueError(
-                f"another training run is at work in {folder}; wait for it, stop it, or choose "
-                "another name or folder"
-            ) from error
-        yield
-    finally:
-        os.close(handle)
+def curve_text(rows: Sequence[Mapping[str, Any]], columns: Sequence[str] | None = None) -> str:
+    """Rows of a learning curve as CSV; columns in the order in which they occur if not given."""
+    columns = columns or list(dict.fromkeys(name for row in rows for name in row))
+    file = io.StringIO(newline="")
+    writer = csv.DictWriter(file, columns, lineterminator="\n")
+    writer.writeheader()
+    for row in rows:
+        plain = {k: np.asarray(v).tolist() if hasattr(v, "shape") else v for k, v in row.items()}
+        writer.writerow(plain)
+    return file.getvalue()
 
 
 def read_curve(path: str | Path) -> dict[str, np.ndarray]:
@@ -294,7 +293,7 @@ def read_curve(path: str | Path) -> dict[str, np.ndarray]:
                 raise ValueError(f"a row of {len(row)} cells under a header of {len(names)}")
         numbers = [[float(cell) if cell else np.nan for cell in row] for row in rows]
     except (csv.Error, ValueError) as error:
-        raise ValueError(f"{path} is no learning curve ({error}); {fix}") from error
+        raise ValueError(f"{path} is not a learning curve ({error}); {fix}") from error
     return dict(zip(names, np.array(numbers).T, strict=True))
 
 
@@ -335,16 +334,7 @@ def load_arrays(path: str | Path, like):
     expected = dict(_leaves(like, shapes_only=True))
 
     def check(header):
-        problems = [f"{name} is missing" for name in expected if name not in header]
-        problems += [f"{name} is unknown" for name in header if name not in expected]
-        for name, (shape, dtype) in expected.items():
-            if name in header and header[name] != (shape, dtype):
-                own_shape, own = header[name]
-                problems.append(f"{name} is {own}{list(own_shape)}, expected {dtype}{list(shape)}")
-        if problems:
-            more = f" and {len(problems) - 3} more" if len(problems) > 3 else ""
-            listing = "; ".join(problems[:3]) + more
-            raise ValueError(f"{path} does not fit the state to be restored: {listing}; {fix}")
+        require_arrays(header, expected, f"{path} does not fit the state to be restored", fix)
 
     stored = read_safetensors(path, fix, check)
     # Files that are older than the checksum have none.

@@ -6,6 +6,8 @@ import platform
 import sys
 from pathlib import Path
 
+import platformdirs
+
 
 def cache_folder() -> Path:
     """Where compiled programs are kept between runs.
@@ -18,11 +20,10 @@ def cache_folder() -> Path:
     chosen = os.environ.get("JAX_COMPILATION_CACHE_DIR")
     if chosen:
         return Path(chosen).expanduser()
-    if sys.platform == "darwin":
-        base = Path.home() / "Library" / "Caches"
-    else:
-        base = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
-    return base / "shapebody" / "jax" / _processor()
+    folder = platformdirs.user_cache_path("shapebody", appauthor=False)
+    if not folder.is_absolute():
+        raise RuntimeError("the user's home folder is unknown; set HOME")
+    return folder / "jax" / _processor()
 
 
 def _processor() -> str:

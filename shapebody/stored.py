@@ -41,7 +41,7 @@ def read_text(path: Path, fix: str) -> str:
     try:
         return path.read_bytes().decode("utf-8")
     except UnicodeDecodeError as error:
-        raise ValueError(f"{path} is damaged: it is no UTF-8 text ({error}); {fix}") from error
+        raise ValueError(f"{path} is damaged: it is not UTF-8 text ({error}); {fix}") from error
 
 
 def require_regular_file(path: Path, fix: str) -> None:
@@ -49,7 +49,7 @@ def require_regular_file(path: Path, fix: str) -> None:
     if not path.exists():
         raise FileNotFoundError(f"{path} does not exist; {fix}")
     if not path.is_file():
-        raise ValueError(f"{path} is no regular file; {fix}")
+        raise ValueError(f"{path} is not a regular file; {fix}")
 
 
 def read_json(path: Path, fix: str, finite: bool = True) -> Any:
@@ -62,7 +62,7 @@ def read_json(path: Path, fix: str, finite: bool = True) -> Any:
         strict = dict(parse_constant=_refuse, parse_float=_finite) if finite else {}
         value = json.loads(text, **strict)
     except (ValueError, RecursionError) as error:
-        raise ValueError(f"{path} is damaged: it is no valid JSON ({error}); {fix}") from error
+        raise ValueError(f"{path} is damaged: it is not valid JSON ({error}); {fix}") from error
     if _depth(value) > DEPTH_LIMIT:
         raise ValueError(
             f"{path} is damaged: more than {DEPTH_LIMIT} lists and objects inside each other; {fix}"
@@ -71,7 +71,7 @@ def read_json(path: Path, fix: str, finite: bool = True) -> Any:
 
 
 def _refuse(constant: str):
-    raise ValueError(f"{constant} is no JSON number")
+    raise ValueError(f"{constant} is not a JSON number")
 
 
 def _finite(text: str) -> float:
@@ -100,6 +100,22 @@ _DTYPES = {
 } | {"BOOL": np.dtype(bool)}
 
 
+def require_arrays(found: Header, expected: Header, what: str, fix: str) -> None:
+    """ValueError if arrays have other names, shapes or types than expected.
+
+    what: begins the message, such as "x.safetensors does not fit its configuration".
+    """
+    problems = [f"{name} is missing" for name in expected if name not in found]
+    problems += [f"{shown(name)} is unknown" for name in found if name not in expected]
+    for name, (shape, dtype) in expected.items():
+        if name in found and found[name] != (shape, dtype):
+            own_shape, own = found[name]
+            problems.append(f"{name} is {own}{list(own_shape)}, expected {dtype}{list(shape)}")
+    if problems:
+        more = f" and {len(problems) - 3} more" if len(problems) > 3 else ""
+        raise ValueError(f"{what}: {'; '.join(problems[:3])}{more}; {fix}")
+
+
 def read_safetensors(
     path: Path, fix: str, check: Callable[[Header], None] | None = None
 ) -> dict[str, np.ndarray]:
@@ -113,7 +129,7 @@ def read_safetensors(
     try:
         return safetensors.numpy.load(path.read_bytes())
     except Exception as error:  # the reader has many kinds
-        raise ValueError(f"{path} is cut off or no safetensors file ({error}); {fix}") from error
+        raise ValueError(f"{path} is cut off or not a safetensors file ({error}); {fix}") from error
 
 
 def read_number(path: Path, name: str, fix: str) -> int:
@@ -156,10 +172,10 @@ def _safetensors_header(path: Path, fix: str):
         if end != size:
             raise ValueError(f"{size:,} bytes, expected {end:,}")
         if not isinstance(metadata, dict):
-            raise ValueError("__metadata__ is no object")
+            raise ValueError("__metadata__ is not an object")
     except (ValueError, LookupError, TypeError, AttributeError, RecursionError) as error:
         raise ValueError(
-            f"{path} is cut off or no safetensors file ({type(error).__name__}: {error}); {fix}"
+            f"{path} is cut off or not a safetensors file ({type(error).__name__}: {error}); {fix}"
         ) from error
     return header, places, metadata
 
@@ -168,32 +184,21 @@ _COMPRESSIONS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
 # Of these alone, Python's zipfile expands no more at a time than is asked for.
 
 
-def read_npz(path: Path, expected: Mapping[str, tuple], fix: str) -> dict[str, np.ndarray]:
-    """Arrays of an .npz file.
+def read_npz(path: Path, expected: Header, fix: str) -> dict[str, np.ndarray]:
+    """Arrays of an .npz file, all of one length M and together of at most `ARRAYS_LIMIT` bytes.
 
-    expected: by name, shape and type. The first axis is the same of all arrays, and may have any
-    length (None); all together have at most `ARRAYS_LIMIT` bytes.
+    expected: by name, shape after the first axis, and type.
     """
     require_regular_file(path, fix)
-    problems, arrays = [], {}
+    arrays = {}
     try:
         with zipfile.ZipFile(path) as archive:
             entries = {x.filename.removesuffix(".npy"): x for x in archive.infolist()}
-            if len(entries) < len(archive.infolist()):
-                raise ValueError("an array is there twice")
-            problems += [f"{name} is missing" for name in expected if name not in entries]
-            problems += [f"{shown(x)} is unknown" for x in entries if x not in expected]
-            if any(x.compress_type not in _COMPRESSIONS for x in entries.values()):
-                raise ValueError("a compression that np.savez does not use")
-            total = sum(entry.file_size for entry in entries.values())
-            if total > ARRAYS_LIMIT:
-                problems.append(f"it expands to {total:,} bytes, at most {ARRAYS_LIMIT:,} can be")
-            lengths = set()
+            problems = _problems_of_entries(entries, archive, expected)
             for name in () if problems else expected:
+                rest, kind = expected[name][0], np.dtype(expected[name][1])
                 with archive.open(entries[name]) as file:
                     shape, dtype, start = _npy_header(file)
-                    rest, kind = expected[name][0][1:], np.dtype(expected[name][1])
-                    lengths.add(shape[:1])
                     if shape[1:] != rest or (dtype, len(shape)) != (kind, len(rest) + 1):
                         wanted = ", ".join(map(str, ("M", *rest)))
                         problems.append(
@@ -204,14 +209,29 @@ def read_npz(path: Path, expected: Mapping[str, tuple], fix: str) -> dict[str, n
                     if entries[name].file_size != start + size:
                         raise ValueError(f"{name} is not as long as its shape says")
                     arrays[name] = np.frombuffer(file.read(size + 1), kind).reshape(shape).copy()
-            if len(lengths) > 1:
-                problems.append(f"the arrays have the different lengths {sorted(lengths)}")
     except Exception as error:  # zipfile, zlib, NumPy's header: each has many kinds
         text = f"{type(error).__name__}: {error}"
-        raise ValueError(f"{path} is cut off or no state bank ({text}); {fix}") from error
+        raise ValueError(f"{path} is cut off or not a state bank ({text}); {fix}") from error
+    lengths = sorted({len(array) for array in arrays.values()})
+    if len(lengths) > 1:
+        problems.append(f"its arrays have the different lengths {lengths}")
     if problems:
         raise ValueError(f"{path} is not as expected: {'; '.join(problems[:3])}; {fix}")
     return arrays
+
+
+def _problems_of_entries(entries, archive, expected: Header) -> list[str]:
+    """What is wrong with the names and sizes in an archive, before anything is expanded."""
+    if len(entries) < len(archive.infolist()):
+        raise ValueError("an array is there twice")
+    if any(entry.compress_type not in _COMPRESSIONS for entry in entries.values()):
+        raise ValueError("a compression that np.savez does not use")
+    problems = [f"{name} is missing" for name in expected if name not in entries]
+    problems += [f"{shown(name)} is unknown" for name in entries if name not in expected]
+    total = sum(entry.file_size for entry in entries.values())
+    if total > ARRAYS_LIMIT:
+        problems.append(f"it expands to {total:,} bytes, at most {ARRAYS_LIMIT:,} can be")
+    return problems
 
 
 def _npy_header(file) -> tuple[tuple[int, ...], np.dtype, int]:

@@ -50,7 +50,14 @@ from arguments import (
     thing,
 )
 
+from shapebody.task.env import Trajectory
+from shapebody.training.update import Learner
+
 INTERNAL = {
+    "agent.description": "reads and writes agent.json, for `agent.store`",
+    "training.progress": "shows and records what `training.trainer` hands over",
+    "training.replacing": "looks at folders of `training.train`",
+    "training.run_state": "looks at folders of `training.trainer` and `training.train`",
     "configuration": "types of settings: the checks themselves",
     "arguments": "the checks themselves: every test here is one of them",
     "design.export": "writes embodiments of `design.space`, which has looked at the design",
@@ -138,7 +145,6 @@ UNCHECKED = {
     "physics.mjx.PhysicsState": RESULT,
     "training.update.Learner": RESULT,
     "training.trainer.Trainer.agent": "takes what `state_bank` returned",
-    "training.losses.command_changes": FORMULA,
     "evaluation.recording.Recording": RESULT,
     "robot.robot.Robot": RESULT,
     "robot.robot.examine": "takes a path of `find`",
@@ -165,14 +171,54 @@ UNCHECKED |= {
     "training.config.as_robots": "a check itself, called by `TrainConfig`",
     "training.config.located": "takes a robot of a `TrainConfig`",
     "training.config.robot_name": "a check itself, called by `TrainConfig`",
-    "agent.store.read_metadata": "belongs to `stored`",
+    "agent.agent.flat_states": "takes an agent that `check_agent` has looked at",
+    "agent.agent.flat_weights": "takes an agent that `check_agent` has looked at",
+    "agent.agent.hash_arrays": "takes what `flat_weights` or `flat_states` returned",
+    "agent.store.expected_weights": "takes configurations, which are checked when made",
+    "agent.store.state_shapes": "takes `Sizes`, which are checked when made",
     "reproduction.critic_ablation.critic_tasks": "`compare_critics` looks at the arguments",
-    "training.trainer.Failures": "counts, inside `ppo.Trainer`",
-    "training.trainer.Failures.add": "counts, inside `ppo.Trainer`",
+    "training.policy_evaluation.evaluation_config": "called by `train_critic`, which has looked",
+    "training.rollout.collect_states": "called by `Trainer.state_bank`",
+    "training.train.run_or_interrupt": "takes a `Trainer`, which looks at the rest",
     "training.trainer.Trainer.alone": "takes nothing",
+    "training.update.Batch": RESULT,
+    "training.update.require_variables": "a check itself, called by `init_learner`",
 }
 UNCHECKED |= dict.fromkeys(
-    (f"files.{name}" for name in "current locked names_path replace_together settle".split()),
+    (
+        f"training.losses.{name}"
+        for name in (
+            "approximate_kl clipped_share command_changes entropy_bonus importance_weight moments "
+            "normalized policy_ratio step_weights surrogate_loss value_loss"
+        ).split()
+    ),
+    FORMULA,
+)
+UNCHECKED |= dict.fromkeys(
+    (
+        f"training.update.{name}"
+        for name in (
+            "apply_at_steps constants critic_loss descend gradient_step gradient_steps "
+            "learning_rate minibatch_rows optimizer policy_loss prepare"
+        ).split()
+    ),
+    FORMULA,
+)
+UNCHECKED |= dict.fromkeys(
+    (
+        f"training.rollout.{name}"
+        for name in (
+            "Actor Actor.begin Actor.repeat Actor.reset Actor.result Actor.resume Actor.wait "
+            "Failures Failures.add"
+        ).split()
+    ),
+    "works inside `training.trainer.Trainer`",
+)
+UNCHECKED |= dict.fromkeys(
+    (
+        f"files.{name}"
+        for name in "current curve_text locked names_path replace_together settle".split()
+    ),
     "called by `checkpoints` and `experiments`, which have looked at the path",
 )
 UNCHECKED |= dict.fromkeys(
@@ -233,7 +279,9 @@ PLAYED = dict(frames=FRAMES, fps=FPS)
 WIDTH = optional(integer(1, 100_000))
 NAMES = optional(thing(lambda world: ["unitree_go2"]))
 SECONDS = optional(number(0))
-RESUMED = dict(folder=optional(FOLDER), progress=FLAG, max_seconds=SECONDS, engine=ENGINE)
+CALL = dict(progress=FLAG, max_seconds=SECONDS, engine=ENGINE)
+RESUMED = dict(folder=optional(FOLDER), **CALL)
+RUN = NAME
 CRITICS = thing(lambda world: {"a": world.agent})
 STATES = optional(thing(lambda world: world.agent.states))
 STATE = thing(lambda world: world.state)
@@ -525,14 +573,6 @@ FUNCTIONS = {
             why="any numbers and arrays",
         ),
     ),
-    "training.imitation.begin_run": dict(
-        config=thing(lambda world: world.train_config),
-        teacher=AGENT,
-        steps=STEPS,
-        folder=optional(FOLDER),
-        engine=ENGINE,
-        progress=FLAG,
-    ),
     "task.config.TaskConfig": TASK_FIELDS,
     "task.config.TaskConfig.ancestors": {},
     "task.config.TaskConfig.evaluation": {},
@@ -775,7 +815,10 @@ FUNCTIONS = {
     ),
     "training.trainer.Trainer.save": {},
     "training.trainer.Trainer.save_agent": dict(folder=optional(FOLDER)),
-    "training.trainer.Trainer.start": {},
+    "training.trainer.Trainer.everything": {},
+    "training.trainer.Trainer.start": dict(
+        changeable=thing(lambda world: ()).also("list", "empty array", why="nothing may differ")
+    ),
     "training.trainer.Trainer.state_bank": dict(rollouts=integer(1, 10**5)),
     "training.losses.advantages": dict(
         reward=array(2, 3),
@@ -786,24 +829,29 @@ FUNCTIONS = {
         discount=PROBABILITY.also(*WRONG, why=FORMULA),
         gae_lambda=PROBABILITY.also(*WRONG, why=FORMULA),
     ),
-    "training.train.anneal": RESUMED
-    | dict(
-        name=NAME,
-        steps=STEPS,
-        last_rate=AT_LEAST_0,
-        replace=FLAG,
-        folder=optional(FOLDER).given(None),
-    ),
-    "training.run_state.as_continued": dict(
-        config=thing(lambda world: world.train_config), folder=optional(FOLDER)
-    ),
-    "training.update.make_policy_function": dict(
+    "training.train.anneal": CALL
+    | dict(name_or_folder=RUN, steps=STEPS, last_rate=AT_LEAST_0, replace=FLAG),
+    "training.rollout.make_policy_function": dict(
         policy=thing(lambda world: world.agent.policy_module), mean_actions=FLAG
     ),
-    "training.update.make_update": dict(
+    "training.train.continue_run": CALL
+    | dict(
+        name_or_folder=RUN,
+        overrides=optional(thing(lambda world: {})).also("dictionary", why="no overrides"),
+        max_steps=optional(STEPS),
+        state_only=FLAG,
+        replace=FLAG,
+    ),
+    "training.update.init_learner": dict(
         config=thing(lambda world: world.train_config),
-        policy=thing(lambda world: world.agent.policy_module),
-        critic=thing(lambda world: world.agent.critic_module),
+        policy=thing(lambda world: world.agent.policy),
+        critic=thing(lambda world: world.agent.critic),
+    ),
+    "training.update.ppo_update": dict(
+        config=thing(lambda world: world.train_config),
+        learner=thing(lambda world: object.__new__(Learner)),
+        trajectory=thing(lambda world: object.__new__(Trajectory)),
+        key=KEY,
     ),
     "training.train.train": dict(
         config=thing(lambda world: world.train_config),

@@ -14,6 +14,7 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays
 from tiny import quick_compilation, tiny_agent, tiny_robot
 
+from shapebody.agent.description import HASHED, hash_document
 from shapebody.agent.store import agents, load_agent, load_curve, save_agent
 from shapebody.design.descriptions import Descriptions
 from shapebody.files import atomic_write, load_arrays, save_arrays
@@ -108,6 +109,8 @@ def test_jax_arrays_and_numpy_values_in_metadata_are_written(agent, tmp_path):
     assert again.hash == agent.hash
     assert again.metadata["seconds"] == 1.5 and again.metadata["curve"] == [0, 1, 2]
     assert again.metadata["config"]["value_latent"] == agent.policy_config.value_latent
+    with pytest.raises(ValueError, match="agent 'tiny': metadata.steps is 'many'; expected"):
+        save_agent(dataclasses.replace(agent, metadata={"steps": "many"}), tmp_path / "b")
     for bad in (float("nan"), object()):
         with pytest.raises(ValueError, match="metadata of agent 'tiny'.*JSON"):
             save_agent(dataclasses.replace(agent, metadata={"x": bad}), tmp_path / "b")
@@ -161,7 +164,7 @@ def test_curve(agent, folder):
     np.testing.assert_array_equal(curve["return"], [1.5, np.nan])
     np.testing.assert_array_equal(curve["std"], [np.nan, 0.5])
     (folder / "curve.csv").write_text("steps,return\n10,many\n")
-    with pytest.raises(ValueError, match="no learning curve .*'many'"):
+    with pytest.raises(ValueError, match="not a learning curve .*'many'"):
         load_curve(folder)
 
 
@@ -269,13 +272,15 @@ def test_files_that_were_edited(agent, folder):
     def edit(change):
         document = json.loads(original["agent.json"])
         change(document)
+        configuration = {name: document.get(name) for name in HASHED}
+        document["configuration_hash"] = hash_document(configuration)
         (folder / "agent.json").write_text(json.dumps(document))
 
     def wider(document):
         document["critic_config"]["head_widths"] = [13, 8]
 
     edit(wider)
-    with pytest.raises(ValueError, match=r"\(critic\).*has shape .*expected .*and \d+ more"):
+    with pytest.raises(ValueError, match=r"critic/.* is float32.*, expected .*and \d+ more"):
         load_agent(folder)
     edit(lambda document: document["sizes"].update(joints=4))
     with pytest.raises(ValueError, match="states.joints.*expected"):
@@ -300,8 +305,8 @@ def test_files_that_were_edited(agent, folder):
 def test_agents_that_do_not_fit_together_are_not_written(agent, tmp_path):
     bad = [
         (dict(robots=()), "names no robots"),
-        (dict(policy=agent.critic), "policy of agent 'tiny' does not fit"),
-        (dict(critic={"params": agent.critic["params"]}), "constants/.* is missing"),
+        (dict(policy=agent.critic), "agent 'tiny' does not fit .*policy/"),
+        (dict(critic={"params": agent.critic["params"]}), "critic/constants/.* is missing"),
         (dict(state_robots=agent.state_robots + 1), "state_robots.*from 0 to 1"),
         (dict(state_robots=None), "state_robots"),
         (dict(state_robots=agent.state_robots / 2), "integers"),
@@ -388,7 +393,7 @@ def test_any_array_keeps_its_bits(value, tmp_path_factory):
 
 def test_arrays_of_another_state_are_refused(tmp_path):
     path = save_arrays(tmp_path / "state", {"a": np.zeros(3), "b": np.zeros(2)})
-    with pytest.raises(ValueError, match=r"state does not fit.*c is missing.*b is unknown"):
+    with pytest.raises(ValueError, match=r"state does not fit.*c is missing.*'b' is unknown"):
         load_arrays(path, {"a": np.zeros(3), "c": 1.0})
     with pytest.raises(ValueError, match=r"a is float64\[3\], expected float32\[3\]"):
         load_arrays(path, {"a": np.zeros(3, np.float32), "b": np.zeros(2)})

@@ -1,7 +1,7 @@
 """PPO: advantages, one update, exact resume, policy evaluation."""
 
 import json
-import time
+import math
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -14,13 +14,13 @@ import pytest
 
 from shapebody.agent.store import load_agent, load_curve, save_agent
 from shapebody.configuration import from_json, to_json
-from shapebody.files import alone_in
+from shapebody.files import alone_in, data_dir
 from shapebody.networks.config import CriticConfig
 from shapebody.task.observations import Observation
 from shapebody.training import config as training_config
-from shapebody.training import losses, policy_evaluation, progress, run_state, train
+from shapebody.training import losses, policy_evaluation, progress, rollout, run_state, train
 from shapebody.training import trainer as training_trainer
-from shapebody.training import update as training_update
+from shapebody.training.update import init_learner, ppo_update
 
 
 def test_advantages_against_a_plain_loop():
@@ -125,7 +125,7 @@ def test_configurations_without_sense(name, value):
 def test_configurations_of_wrong_kinds(name, value):
     with pytest.raises((TypeError, ValueError), match=f"{name} is .*; expected"):
         training_config.TrainConfig.reduced("unitree_go2", **{name: value})
-    with pytest.raises(ValueError, match="scale is 'huge'; expected one of smoke, reduced, full"):
+    with pytest.raises(ValueError, match="scale is 'huge'; expected .*smoke"):
         training_config.TrainConfig.reduced("unitree_go2", scale="huge")
 
 
@@ -143,10 +143,7 @@ def begin(config, folder, engine="auto"):
     """A trainer whose bodies differ, since it begins at c = 0.5; or the one to be continued."""
     trainer = training_trainer.Trainer(config, folder, engine)
     if not trainer.start():
-        env = trainer.env
-        trainer.state = env.reset(trainer.key, coefficient=0.5, spread=True)
-        native = env.engine == "native"
-        trainer.saved_physics = env.physics_arrays() if native else env.physics_state
+        trainer.actor.reset(coefficient=0.5)
     return trainer
 
 
@@ -166,10 +163,9 @@ def test_resume_is_exact(config, straight, tmp_path):
     """Stopped twice, the run ends with the very weights of the uninterrupted one."""
     for steps in (128, 128 * 3, 128 * 4):
         trainer = begin(config, tmp_path)
-        assert trainer.in_step == (steps == 128)
         trainer.run(max_steps=steps, progress=False)
         assert trainer.steps == steps
-    designs = np.asarray(trainer.state.design)
+    designs = np.asarray(trainer.actor.state.design)
     assert np.all(np.abs(designs).max(1) > 0.3) and np.all(np.std(designs, 0)[:100] > 0.1)
     for a, b in zip(leaves(straight[1]), leaves(trainer), strict=True):
         np.testing.assert_array_equal(a, b)
@@ -211,7 +207,7 @@ def test_an_interrupt_saves_an_agent_only_after_an_iteration(config, tmp_path, m
         raise KeyboardInterrupt
 
     with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
-        patch.setattr(training_trainer.Trainer, "_collect", interrupt)
+        patch.setattr(rollout.Actor, "_collect", interrupt)
         train.train(config, tmp_path)
     assert capsys.readouterr().out.endswith("before the first iteration: nothing was saved\n")
     assert not list(tmp_path.glob("agent.json")) + list(tmp_path.glob("*.safetensors"))
@@ -281,86 +277,100 @@ def test_a_run_keeps_its_engine(config, straight, tmp_path, monkeypatch):
     with pytest.raises(ValueError, match="engine is 'mjx', but the run in .* with 'native'"):
         training_trainer.Trainer(config, straight[0], "mjx")
     with pytest.raises(ValueError, match="engine is 'mjx'"):
-        train.anneal(config.name, folder=straight[0], engine="mjx")
-    assert run_state._engine(tmp_path, "mjx") == "mjx"
+        train.anneal(straight[0], engine="mjx")
+    assert run_state.run_engine(tmp_path, "mjx") == "mjx"
     (tmp_path / "training.safetensors").touch()
     for phases, own in [("[{}]", "native"), ('[{"engine": "mjx"}, {}]', "mjx"), ("{", "auto")]:
         (tmp_path / "training.json").write_text(phases)
-        assert run_state._engine(tmp_path, "auto") == own
-    assert run_state._engine(tmp_path, "mjx") == "mjx"
+        assert run_state.run_engine(tmp_path, "auto") == own
+    assert run_state.run_engine(tmp_path, "mjx") == "mjx"
 
 
 def test_a_run_continues_only_with_its_own_configuration(config, tmp_path):
     trainer = training_trainer.Trainer(config, tmp_path)
     trainer.start()
     trainer.run(max_steps=128, progress=False)
-    other = training_trainer.Trainer(replace(config, discount=0.9), tmp_path)
-    with pytest.raises(ValueError, match="discount was 0.99, is 0.9"):
-        other.start()
-    longer = training_trainer.Trainer(replace(config, epochs=1), tmp_path)
-    assert longer.start()
-    assert [phase["from_step"] for phase in longer.phases] == [0, 128]
-    longer.save()
-    # The run's own settings, whatever the defaults are now.
-    assert run_state.as_continued(replace(config, discount=0.9), tmp_path) == longer.config
-    assert run_state.as_continued(config, tmp_path / "nothing") == config
-    other = replace(config, scale="full")
-    assert run_state.as_continued(other, tmp_path) == other
-    scaled = replace(config, policy=replace(config.policy, latent_scale=3.0))
-    with pytest.raises(ValueError, match=r"policy.latent_scale was 1.0, is 3.0.*as_continued"):
-        training_trainer.Trainer(scaled, tmp_path).start()
-    quiet = replace(config, policy=replace(config.policy, std_limits=(0.05, 2.0)))
-    assert training_trainer.Trainer(quiet, tmp_path).start()  # the limits of the noise may change
-    shorter = replace(config, task=replace(config.task, horizon=6, curriculum_length=3))
-    brief = training_trainer.Trainer(shorter, tmp_path)
-    assert brief.start()
-    before = np.asarray(brief.state.horizon)  # an episode that is under way keeps its length
-    brief.run(max_steps=brief.steps + 2 * config.batch, progress=False)
-    after = np.asarray(brief.state.horizon)
-    assert set(after) <= {6} | set(before) and 6 in after
-    (tmp_path / "training.json").write_text(json.dumps(longer.phases))
-    rougher = replace(shorter, task=replace(shorter.task, push_probability=0.5))
-    with pytest.raises(ValueError, match="task.push_probability was 0.002, is 0.5"):
-        training_trainer.Trainer(rougher, tmp_path).start()
-    # The field is named even where the arrays have other shapes.
-    wider = replace(config, policy=replace(config.policy, core_widths=(12, 8)))
-    with pytest.raises(ValueError, match=r"core_widths was \[16, 8\], is \[12, 8\]"):
-        training_trainer.Trainer(wider, tmp_path).start()
-    with pytest.raises(ValueError, match="num_envs was 16, is 32"):
-        training_trainer.Trainer(replace(config, num_envs=32), tmp_path).start()
+    for changes, message in (
+        (dict(discount=0.9), "discount was 0.99, is 0.9"),
+        (dict(epochs=1, total_steps=1280), r"total_steps was 640, is 1280; epochs was 2, is 1\)"),
+        (dict(policy=replace(config.policy, latent_scale=3.0)), "policy.latent_scale was 1.0, is"),
+        (dict(task=replace(config.task, push_probability=0.5)), "task.push_probability was 0.002,"),
+        # The setting is named even where the arrays have other shapes.
+        (
+            dict(policy=replace(config.policy, core_widths=(12, 8))),
+            r"core_widths was \[16, 8\], is \[12, 8\]",
+        ),
+        (dict(num_envs=32), "num_envs was 16, is 32.*continue_run, choose another name"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            training_trainer.Trainer(replace(config, **changes), tmp_path).start()
     # A run that is older than a setting goes on with the setting's default.
-    for phase in longer.phases:
-        del phase["config"]["task"]["design_radius"]
-    with pytest.raises(ValueError, match="has changed since this trainer read it"):
-        longer.save()  # over the state of `brief`, which is newer
-    (tmp_path / "training.json").write_text(json.dumps(longer.phases))
-    assert longer.start()
-    longer.phases[0]["robots"]["unitree_go2"] = "another file"
-    longer.save()
+    path = tmp_path / "training.json"
+    phases = json.loads(path.read_text())
+    del phases[0]["config"]["task"]["design_radius"]
+    path.write_text(json.dumps(phases))
+    assert trainer.start()
+    trainer.phases[0]["robots"]["unitree_go2"] = "another file"
+    trainer.save()
     with pytest.raises(ValueError, match="file of robot unitree_go2 has changed"):
-        longer.start()
-    (tmp_path / "training.json").write_text("{")
+        trainer.start()
+    path.write_text("{")
     with pytest.raises(ValueError, match="training.json is missing or damaged"):
-        longer.start()
-    (tmp_path / "training.safetensors").rename(tmp_path / "gone")
-    assert run_state.as_continued(config, tmp_path) == config  # a new run, with today's settings
+        trainer.start()
 
 
-def test_the_default_configuration_continues_any_run(config, tmp_path, monkeypatch):
-    other = replace(config, epochs=1, policy=replace(config.policy, latent_scale=3.0))
-    trainer = training_trainer.Trainer(other, tmp_path)
-    trainer.start()
-    trainer.run(max_steps=config.batch, progress=False)
-    default = training_config.TrainConfig.smoke(config.robots[0], name=config.name)
-    monkeypatch.setattr(training_config.TrainConfig, "at_scale", lambda *given, **changes: default)
-    asked = []
-    monkeypatch.setattr(
-        training_trainer.Trainer, "run", lambda self, *given: asked.append(self.config)
+def test_a_run_goes_on_with_what_it_has(config, tmp_path):
+    """Whatever the defaults are now; settings are overridden by name, and that is recorded."""
+    config = replace(config, num_envs=8, minibatch_size=32, epochs=1, name="walker")
+    arguments = dict(progress=False, state_only=True)
+    with pytest.raises(FileNotFoundError, match="there is no run in .*training.safetensors"):
+        train.continue_run(tmp_path, **arguments)
+    train.train(config, tmp_path, max_steps=64, **arguments)
+    train.continue_run(tmp_path, max_steps=128, **arguments)
+    path = tmp_path / "training.json"
+    assert [phase["from_step"] for phase in json.loads(path.read_text())] == [0]
+    for overrides, message in (
+        (dict(num_envs=16), "overrides has 'num_envs'; expected settings .*epochs"),
+        (dict(discount=2.0), "discount is 2.0; expected a probability"),
+        (dict(robots=("golem",)), "robots was .*unitree_go2.*, is .*golem"),
+        (dict(policy=replace(config.policy, core_widths=(12, 8))), "does not fit the state"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            train.continue_run(tmp_path, overrides, **arguments)
+    # The limits of the noise and the lengths of episodes fit any state.
+    overrides = dict(
+        policy=replace(config.policy, std_limits=(0.05, 2.0)),
+        task=replace(config.task, horizon=6, curriculum_length=3),
+        learning_rate=(1e-4, 1e-4),
     )
-    train.train(default, tmp_path, progress=False, state_only=True)
-    assert asked == [other]
-    with pytest.raises(ValueError, match="another configuration"):  # what is asked for is meant
-        train.train(replace(config, discount=0.9), tmp_path, progress=False, state_only=True)
+    train.continue_run(tmp_path, overrides, max_steps=320, **arguments)
+    phases = json.loads(path.read_text())
+    assert [phase["from_step"] for phase in phases] == [0, 128]
+    assert phases[1]["config"]["learning_rate"] == [1e-4, 1e-4]
+    changed = replace(config, **overrides)
+    assert run_state.read_config(tmp_path) == changed
+    trainer = training_trainer.Trainer(changed, tmp_path)
+    assert trainer.start() and 6 in np.asarray(trainer.actor.state.horizon)
+    with pytest.raises(ValueError, match="learning_rate was .*; policy.std_limits was|policy.std"):
+        train.train(config, tmp_path, **arguments)
+    train.train(changed, tmp_path, max_steps=384, **arguments)
+    assert json.loads(path.read_text()) == phases
+
+
+@pytest.mark.parametrize("name", ["unitree_go2", "mit_humanoid", "golem"])
+def test_shipped_runs_have_one_configuration(name):
+    """Their training.json has several phases, of which the last one counts."""
+    folder = data_dir() / "checkpoints" / name
+    config = run_state.read_config(folder)
+    steps = run_state.finished_iterations(folder) * config.batch
+    robot = SimpleNamespace(name=name, hash=run_state.read_phases(folder)[0]["robots"][name])
+    phases = run_state.continued_phases(folder, config, steps, [robot])
+    assert len(phases) > 1 and phases == run_state.read_phases(folder)
+    assert config != training_config.TrainConfig.reduced(name)
+    with pytest.raises(ValueError, match="has another configuration"):
+        run_state.continued_phases(
+            folder, training_config.TrainConfig.reduced(name), steps, [robot]
+        )
 
 
 @pytest.mark.parametrize("call", [train.train, training_config.TrainConfig.reduced])
@@ -382,7 +392,7 @@ def test_two_runs_in_one_folder(config, tmp_path):
 def test_annealing_leaves_the_run_as_it_is(config, tmp_path, monkeypatch):
     config = replace(config, num_envs=8, minibatch_size=32, epochs=1, name="walker")
     with pytest.raises(ValueError, match="training.safetensors is missing"):
-        train.anneal("walker", folder=tmp_path)
+        train.anneal(tmp_path)
     trainer = training_trainer.Trainer(config, tmp_path)
     trainer.start()
     trainer.run(max_steps=2 * config.batch, progress=False)
@@ -391,12 +401,12 @@ def test_annealing_leaves_the_run_as_it_is(config, tmp_path, monkeypatch):
 
     steps, last_rate = 3 * config.batch, 1e-6
     # A time limit stops it early; the same call goes on with what is left.
-    arguments = dict(steps=steps, last_rate=last_rate, folder=tmp_path, progress=False)
-    assert train.anneal("walker", max_seconds=0.0, **arguments) is None
+    arguments = dict(steps=steps, last_rate=last_rate, progress=False)
+    assert train.anneal(tmp_path, max_seconds=0.0, **arguments) is None
     with pytest.raises(ValueError, match="delete that folder to begin anew"):
-        train.anneal("walker", **arguments | {"steps": 2 * config.batch})
+        train.anneal(tmp_path, **arguments | {"steps": 2 * config.batch})
     assert not (tmp_path / "agent.json").exists()
-    agent = train.anneal("walker", **arguments)
+    agent = train.anneal(tmp_path, **arguments)
     assert agent.metadata["steps"] == 5 * config.batch
     assert load_agent(tmp_path).hash == agent.hash
     assert {file: (tmp_path / file).read_bytes() for file in run_state.STATE_FILES} == before
@@ -408,20 +418,20 @@ def test_annealing_leaves_the_run_as_it_is(config, tmp_path, monkeypatch):
     rows = load_curve(tmp_path)
     assert rows["steps"][-1] == 5 * config.batch
     with pytest.raises(ValueError, match="agent .* has 320 steps, the run that would .* it 192"):
-        train.anneal("walker", **arguments | {"steps": config.batch})
+        train.anneal(tmp_path, **arguments | {"steps": config.batch})
     with pytest.raises(ValueError, match="last_rate is 0.01, above the present rate"):
-        train.anneal("walker", **arguments | {"last_rate": 1e-2})
+        train.anneal(tmp_path, **arguments | {"last_rate": 1e-2})
     for steps in (0, -5, 1.5):
         with pytest.raises(ValueError, match=f"steps is {steps}; expected an integer of at least"):
-            train.anneal("walker", **arguments | {"steps": steps})
+            train.anneal(tmp_path, **arguments | {"steps": steps})
     document = json.loads((tmp_path / "agent.json").read_text())
     document["metadata"]["policy_evaluation"] = {}
     (tmp_path / "agent.json").write_text(json.dumps(document))
     with pytest.raises(ValueError, match="critic from policy evaluation"):
-        train.anneal("walker", **arguments | {"steps": 9 * config.batch})
+        train.anneal(tmp_path, **arguments | {"steps": 9 * config.batch})
     assert not (tmp_path / "annealed").exists() and load_agent(tmp_path).hash == agent.hash
     arguments |= {"steps": 2 * config.batch, "replace": True}
-    assert train.anneal("walker", max_seconds=0.0, **arguments) is None
+    assert train.anneal(tmp_path, max_seconds=0.0, **arguments) is None
     assert (tmp_path / "annealed" / "training.safetensors").exists()
 
 
@@ -465,10 +475,10 @@ def test_a_broken_minibatch_changes_nothing(straight):
     env = trainer.env
     state = env.reset(jax.random.PRNGKey(1), coefficient=0.0)
     _, trajectory = env.rollout(
-        trainer.act, trainer.learner.policy, state, jax.random.PRNGKey(2), 8
+        trainer.actor.act, trainer.learner.policy, state, jax.random.PRNGKey(2), 8
     )
     trajectory = replace(trajectory, reward=np.full_like(trajectory.reward, np.nan))
-    after, _ = trainer.update(trainer.learner, trajectory, jax.random.PRNGKey(3))
+    after, _ = ppo_update(trainer.config, trainer.learner, trajectory, jax.random.PRNGKey(3))
     assert all(np.isfinite(x).all() for x in jax.tree.leaves(after))
 
 
@@ -476,14 +486,15 @@ def test_update_follows_the_advantage(straight):
     """Actions with positive advantage become more likely, and the critic fits its targets."""
     _, trainer = straight
     env, config = trainer.env, replace(trainer.config, epochs=8, entropy_coefficient=0.0)
-    update, start = training_update.make_update(config, trainer.policy, trainer.critic)
-    learner = start(trainer.learner.policy, trainer.learner.critic)
+    learner = init_learner(config, trainer.learner.policy, trainer.learner.critic)
     state = env.reset(jax.random.PRNGKey(1), coefficient=0.0)
-    state, trajectory = env.rollout(trainer.act, learner.policy, state, jax.random.PRNGKey(2), 8)
+    state, trajectory = env.rollout(
+        trainer.actor.act, learner.policy, state, jax.random.PRNGKey(2), 8
+    )
     # Reward actions of the first joint by their sign.
     sign = np.sign(np.asarray(trajectory.action)[..., 0])
     trajectory = replace(trajectory, reward=sign.astype(np.float32))
-    after, metrics = update(learner, trajectory, jax.random.PRNGKey(3))
+    after, metrics = ppo_update(config, learner, trajectory, jax.random.PRNGKey(3))
 
     def mean_action(policy):
         mean, _ = trainer.policy.apply(policy, state.descriptions, trajectory.last_observation)
@@ -493,7 +504,7 @@ def test_update_follows_the_advantage(straight):
     assert metrics["updates"] > 0 and 0 < metrics["kl"] < 0.5
     later = after
     for i in range(5):
-        later, more = update(later, trajectory, jax.random.PRNGKey(4 + i))
+        later, more = ppo_update(config, later, trajectory, jax.random.PRNGKey(4 + i))
     assert more["value_loss"] < metrics["value_loss"]
 
 
@@ -502,7 +513,7 @@ def test_advantages_end_where_the_command_changes(straight):
     _, trainer = straight
     state = trainer.env.reset(jax.random.PRNGKey(1), coefficient=0.0)
     learner, key = trainer.learner, jax.random.PRNGKey(2)
-    state, trajectory = trainer.env.rollout(trainer.act, learner.policy, state, key, 8)
+    state, trajectory = trainer.env.rollout(trainer.actor.act, learner.policy, state, key, 8)
     general = np.array(trajectory.observation.general)
     general[4:, :, 3:6] = general[:4, :, 3:6] + 0.5
     after = replace(
@@ -518,8 +529,8 @@ def test_advantages_end_where_the_command_changes(straight):
 
     def learn(trajectory, **changes):
         config = replace(trainer.config, epochs=1, entropy_coefficient=0.0, **changes)
-        update, start = training_update.make_update(config, trainer.policy, trainer.critic)
-        new, _ = update(start(learner.policy, learner.critic), trajectory, jax.random.PRNGKey(3))
+        fresh = init_learner(config, learner.policy, learner.critic)
+        new, _ = ppo_update(config, fresh, trajectory, jax.random.PRNGKey(3))
         return [
             np.concatenate([np.ravel(x) for x in jax.tree.leaves(variables)])
             for variables in (new.policy, new.critic)
@@ -542,12 +553,14 @@ def test_the_critic_has_a_lambda_of_its_own(straight):
     _, trainer = straight
     state = trainer.env.reset(jax.random.PRNGKey(1), coefficient=0.0)
     learner = trainer.learner
-    _, trajectory = trainer.env.rollout(trainer.act, learner.policy, state, jax.random.key(2), 8)
+    _, trajectory = trainer.env.rollout(
+        trainer.actor.act, learner.policy, state, jax.random.key(2), 8
+    )
 
     def learn(value_lambda, gae_lambda):
         config = replace(trainer.config, epochs=1, value_lambda=value_lambda, gae_lambda=gae_lambda)
-        update, start = training_update.make_update(config, trainer.policy, trainer.critic)
-        new, _ = update(start(learner.policy, learner.critic), trajectory, jax.random.PRNGKey(3))
+        fresh = init_learner(config, learner.policy, learner.critic)
+        new, _ = ppo_update(config, fresh, trajectory, jax.random.PRNGKey(3))
         return [
             np.concatenate([np.ravel(x) for x in jax.tree.leaves(v)])
             for v in (new.policy, new.critic)
@@ -581,12 +594,12 @@ def test_a_row_that_was_cut_off_leaves_the_curve(tmp_path):
     # Within the steps, after some cells, within the last number, and with the next row behind it.
     for torn in ("2", "256,1.5,", last[:-2], last[:-1], "", last[:9] + last):
         path.write_text(header + first + torn)
-        progress._Curve(path, steps=256)
+        progress.Curve(path, steps=256)
         assert path.read_text() == header + first, torn
     path.write_text(header + first + last)
-    progress._Curve(path, steps=256)
+    progress.Curve(path, steps=256)
     assert path.read_text() == header + first + last
-    progress._Curve(path, steps=128)
+    progress.Curve(path, steps=128)
     assert path.read_text() == header + first
 
 
@@ -640,20 +653,45 @@ def test_mean_actions_are_without_noise(config, tmp_path):
         first = []
         for key in jax.random.split(trainer.key):
             state = trainer.env.reset(trainer.key, coefficient=1.0)
-            arguments = trainer.act, trainer.learner.policy, state, key, config.rollout_length
+            arguments = trainer.actor.act, trainer.learner.policy, state, key, config.rollout_length
             first.append(np.asarray(trainer.env.rollout(*arguments)[1].action)[0])
         assert np.all((first[0] == first[1]) == mean_actions)
 
 
-def test_the_time_left_is_that_of_the_call(capsys):
-    def left(last, seconds):
-        curve = SimpleNamespace(latest=dict(steps_per_second=100.0, coefficient=0.0))
-        progress._Report(last, time.monotonic() + seconds + 0.5, True).show(4_000, curve)
-        return capsys.readouterr().out.split()[-2]
+@pytest.mark.parametrize("terminal", [True, False])
+def test_progress_counts_from_the_second_iteration(capsys, monkeypatch, terminal):
+    monkeypatch.setattr("sys.stdout.isatty", lambda: terminal, raising=False)
+    now = [1000.0]
+    for name in ("time.monotonic", "time.time"):
+        monkeypatch.setattr(name, lambda: now[0])
 
-    assert left(64_000, float("inf")) == "10m00"
-    assert left(64_000, 120) == "2m00"
-    assert left(64_000, -1) == "0m00"
+    def shown(last, seconds):
+        curve = SimpleNamespace(latest=dict(coefficient=0.0))
+        now[0] += 1000
+        with progress.Progress(last, now[0] + seconds, True) as report:
+            now[0] += 300  # compilation
+            report.show(4_000, curve)
+            for steps in range(5_000, 9_000, 1_000):
+                now[0] += 10
+                report.show(steps, curve)
+        return capsys.readouterr().out
+
+    out = shown(68_000, math.inf)
+    assert out.rstrip().endswith(
+        "8,000 steps  no episode has ended yet  c 0.00  100 steps/s  10:00 left"
+    )
+    assert ("\r" in out) == terminal
+    assert "02:00 left" in shown(68_000, 460)
+    assert "00:00 left" in shown(68_000, 0)
+    lines = shown(68_000, math.inf).strip().splitlines()
+    assert terminal or len(lines) == 2  # at most one a minute, and one at the end
+
+
+def test_compilation_is_announced(capsys):
+    progress.announce("auto", 1, False)
+    assert not capsys.readouterr().out
+    progress.announce("native", 5, True)
+    assert capsys.readouterr().out.startswith("compiling, about ")
 
 
 @pytest.mark.slow
@@ -664,7 +702,7 @@ def test_training_on_mjx_resumes(tmp_path):
     straight.run(max_steps=96, progress=False)
     for steps in (32, 96):
         trainer = begin(config, tmp_path / "stopped", "mjx" if steps == 32 else "auto")
-        assert trainer.in_step == (steps == 32) and trainer.env.engine == "mjx"
+        assert trainer.env.engine == "mjx"
         trainer.run(max_steps=steps, progress=False)
     assert trainer.steps == 96 and np.any(np.asarray(trainer.state.design))
     for a, b in zip(leaves(straight), leaves(trainer), strict=True):

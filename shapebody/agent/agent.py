@@ -11,6 +11,7 @@ from typing import Any
 
 import jax
 import numpy as np
+from flax.traverse_util import flatten_dict
 
 from shapebody.arguments import require_kind
 from shapebody.design.descriptions import Descriptions, Sizes
@@ -70,18 +71,18 @@ class Agent:
     @functools.cached_property
     def hash(self) -> str:
         """SHA-256 of the weights of policy and critic, hexadecimal."""
-        return _hash(_flat_weights(self))
+        return hash_arrays(flat_weights(self))
 
     @functools.cached_property
     def policy_hash(self) -> str:
         """SHA-256 of the policy's weights alone, hexadecimal."""
-        return _hash({k: v for k, v in _flat_weights(self).items() if k.startswith("policy")})
+        return hash_arrays({k: v for k, v in flat_weights(self).items() if k.startswith("policy")})
 
     @property
     def states_hash(self) -> str | None:
         """SHA-256 of the state bank; None without one."""
-        states = _flat_states(self)
-        return None if states is None else _hash(states)
+        states = flat_states(self)
+        return None if states is None else hash_arrays(states)
 
     @property
     def num_states(self) -> int:
@@ -107,24 +108,18 @@ def _values(config: CriticConfig):
 
 
 def require_agent(agent) -> Agent:
-    """The argument; TypeError if it is no `Agent`, for example the name of one."""
+    """The argument; TypeError if it is not an `Agent`, for example the name of one."""
     return require_kind("agent", agent, Agent, "load it with shapebody.load_agent(...)")
 
 
-def _flatten(tree, prefix="") -> dict[str, Any]:
-    flat = {}
-    for key, value in tree.items():
-        name = f"{prefix}{key}"
-        flat.update(_flatten(value, name + "/") if isinstance(value, Mapping) else {name: value})
-    return flat
-
-
-def _flat_weights(agent: Agent) -> dict[str, np.ndarray]:
-    flat = _flatten({"policy": agent.policy, "critic": agent.critic})
+def flat_weights(agent: Agent) -> dict[str, np.ndarray]:
+    """Weights of both networks as float32, by names such as "policy/params/core/layer_0/bias"."""
+    flat = flatten_dict({"policy": agent.policy, "critic": agent.critic}, sep="/")
     return {name: np.array(flat[name], np.float32, order="C") for name in sorted(flat)}
 
 
-def _flat_states(agent: Agent) -> dict[str, np.ndarray] | None:
+def flat_states(agent: Agent) -> dict[str, np.ndarray] | None:
+    """The state bank: parts of the observations as float32, state_robots as int32; or None."""
     if agent.states is None:
         return None
     names = [f.name for f in dataclasses.fields(Observation)]
@@ -132,7 +127,7 @@ def _flat_states(agent: Agent) -> dict[str, np.ndarray] | None:
     return flat | {"state_robots": np.array(agent.state_robots, np.int32)}
 
 
-def _hash(arrays: Mapping[str, np.ndarray]) -> str:
+def hash_arrays(arrays: Mapping[str, np.ndarray]) -> str:
     """SHA-256 of named arrays, independent of their order and of the file format."""
     digest = hashlib.sha256()
     for name in sorted(arrays):

@@ -5,9 +5,9 @@ from dataclasses import field
 from pathlib import Path
 from typing import Annotated, Literal
 
-from pydantic import BeforeValidator, Field
+from pydantic import BeforeValidator
 
-from shapebody.arguments import require_choice, require_list, require_name, require_path
+from shapebody.arguments import refuse, require_choice, require_list, require_name, require_path
 from shapebody.configuration import (
     FileName,
     Flag,
@@ -34,9 +34,11 @@ SCALES = ("smoke", "reduced", "full")
 
 
 def as_robots(robots) -> tuple[str, ...]:
-    """One name or path, or a list of them, as a tuple of texts."""
+    """One name or path, or a list of them, as a tuple of texts; ValueError for none."""
     single = isinstance(robots, str | Path)
     robots = (robots,) if single else require_list("robots", robots, 1000)
+    if not robots:
+        raise refuse("robots", robots, "at least one name or path of a robot")
     for robot in robots:
         robot_name(robot)
     return tuple(str(robot) for robot in robots)
@@ -45,7 +47,6 @@ def as_robots(robots) -> tuple[str, ...]:
 Size = integer(1, 2**24)
 Robots = Annotated[
     tuple[str, ...],
-    Field(min_length=1),
     BeforeValidator(as_robots),
     expecting("at least one name or path of a robot"),
 ]

@@ -1,6 +1,7 @@
 """Policy evaluation: the policy is frozen, and only critics learn."""
 
 from dataclasses import replace
+from pathlib import Path
 
 from shapebody.agent.agent import Agent, require_agent
 from shapebody.agent.store import chosen_folder, load_agent, save_agent
@@ -15,8 +16,10 @@ from shapebody.configuration import from_json
 from shapebody.networks.config import CriticConfig
 from shapebody.task.config import TaskConfig
 from shapebody.training.config import MOST_STEPS, TrainConfig
-from shapebody.training.run_state import _require_budget, _require_same_robots
-from shapebody.training.train import _metadata, _run
+from shapebody.training.progress import announce
+from shapebody.training.replacing import metadata_in
+from shapebody.training.run_state import require_budget, require_same_robots
+from shapebody.training.train import run_or_interrupt
 from shapebody.training.trainer import Trainer
 
 
@@ -72,16 +75,52 @@ def train_critic(
     if steps is not None:
         require_integer("steps", steps, 1, MOST_STEPS)
     require_engine("engine", engine)
-    _require_budget(None, max_seconds, progress)
-    if folder is None:
-        folder = chosen_folder(None, agent.name)
-        # The agent may come from elsewhere, and its name be that of another one here.
-        if _metadata(folder) and load_agent(folder).policy_hash != agent.policy_hash:
-            raise ValueError(
-                f"the agent in {folder} has another policy than agent {agent.name!r}, whose new "
-                "critic would be saved there; give its own folder (folder=...)"
-            )
-    folder = require_path("folder", folder)
+    require_budget(None, max_seconds, progress)
+    folder = _folder_for(agent) if folder is None else require_path("folder", folder)
+    config = evaluation_config(agent, critic, steps, task_of, **changes)
+    announce(engine, len(config.robots), progress)
+    # The state belongs to this policy: another one starts anew.
+    trainer = Trainer(config, folder / f"critic_{agent.policy_hash[:8]}", engine, agent.policy)
+    phases = agent.metadata.get("phases") or [{}]
+    require_same_robots(phases[0].get("robots", {}), trainer.env.robots, f"agent {agent.name!r}")
+    with trainer.alone():
+        trainer.start(changeable=("total_steps",))
+        run_or_interrupt(trainer, progress, max_seconds=max_seconds)
+        if trainer.steps < config.iterations * config.batch:
+            return agent
+        new = trainer.agent(trainer.state_bank())
+        phase = {name: new.metadata[name] for name in ("config", "steps", "seconds")}
+        new = replace(new, metadata={**agent.metadata, "policy_evaluation": phase})
+        save_agent(new, folder)
+    return new
+
+
+def _folder_for(agent: Agent) -> Path:
+    """data/checkpoints/<agent>; ValueError if another policy is there.
+
+    The agent may come from elsewhere, and its name be that of another one here.
+    """
+    folder = chosen_folder(None, agent.name)
+    if metadata_in(folder) and load_agent(folder).policy_hash != agent.policy_hash:
+        raise ValueError(
+            f"the agent in {folder} has another policy than agent {agent.name!r}, whose new "
+            "critic would be saved there; give its own folder (folder=...)"
+        )
+    return folder
+
+
+def evaluation_config(
+    agent: Agent,
+    critic: CriticConfig,
+    steps: int | None = None,
+    task_of: str = "evaluation",
+    **changes,
+) -> TrainConfig:
+    """The configuration of the policy evaluation of an agent; arguments as in `train_critic`.
+
+    Raises:
+        ValueError: if the agent does not say how its policy was trained.
+    """
     missing = [name for name in ("config", "scale") if name not in agent.metadata]
     if missing:
         raise ValueError(
@@ -92,44 +131,24 @@ def train_critic(
     trained = from_json(TrainConfig, agent.metadata["config"], what)
     base = TrainConfig.at_scale(agent.metadata["scale"], trained.robots[0], name=agent.name)
     length = max(base.rollout_length, 32)
-    config = replace(
-        base,
-        **{
-            # Robots by the names or files they were trained from.
-            "robots": trained.robots,
-            "seed": trained.seed,
-            "policy": agent.policy_config,
-            "critic": critic,
-            "standardize": True,
-            "learn_policy": False,
-            "mean_actions": True,
-            "epochs": 1,
-            "discount": trained.discount,
-            "gae_lambda": 0.95,
-            "value_lambda": None,
-            # Returns with that λ look further ahead than short rollouts reach.
-            "num_envs": base.batch // length,
-            "rollout_length": length,
-            "total_steps": base.total_steps * 12 // 100 if steps is None else steps,
-            "task": replace(
-                TaskConfig.evaluation() if task_of == "evaluation" else trained.task,
-                horizon=200,
-                design_radius=(0.0, 1.0),
-            ),
-            **changes,
-        },
-    )
-    # The state belongs to this policy: another one starts anew.
-    trainer = Trainer(config, folder / f"critic_{agent.policy_hash[:8]}", engine, agent.policy)
-    phases = agent.metadata.get("phases") or [{}]
-    _require_same_robots(phases[0].get("robots", {}), trainer.env.robots, f"agent {agent.name!r}")
-    with trainer.alone():
-        trainer.start()
-        _run(trainer, progress, None, max_seconds)
-        if trainer.steps < config.iterations * config.batch:
-            return agent
-        sharper = trainer.agent(trainer.state_bank())
-        phase = {name: sharper.metadata[name] for name in ("config", "steps", "seconds")}
-        sharper = replace(sharper, metadata={**agent.metadata, "policy_evaluation": phase})
-        save_agent(sharper, folder)
-    return sharper
+    task = TaskConfig.evaluation() if task_of == "evaluation" else trained.task
+    settings = {
+        # Robots by the names or files they were trained from.
+        "robots": trained.robots,
+        "seed": trained.seed,
+        "policy": agent.policy_config,
+        "critic": critic,
+        "standardize": True,
+        "learn_policy": False,
+        "mean_actions": True,
+        "epochs": 1,
+        "discount": trained.discount,
+        "gae_lambda": 0.95,
+        "value_lambda": None,
+        # Returns with that λ look further ahead than short rollouts reach.
+        "num_envs": base.batch // length,
+        "rollout_length": length,
+        "total_steps": base.total_steps * 12 // 100 if steps is None else steps,
+        "task": replace(task, horizon=200, design_radius=(0.0, 1.0)),
+    }
+    return replace(base, **settings | changes)

@@ -1,18 +1,20 @@
 """The learning curve of a run, and its progress line."""
 
-import csv
-import io
+import math
 import os
 import sys
 import time
 from pathlib import Path
 
 import numpy as np
+from tqdm import tqdm
 
-from shapebody.files import atomic_write, names_path
+from shapebody.files import atomic_write, curve_text, names_path
 from shapebody.stored import read_text
 from shapebody.task.env import Trajectory
 from shapebody.training.run_state import ANEW
+
+# ---------------------------------------------------------------------- the learning curve
 
 CURVE = (
     "steps seconds return length tracking_error coefficient reward non_finite kl clipped std "
@@ -20,16 +22,18 @@ CURVE = (
 ).split()
 """Columns of the learning curve. return, length, tracking_error (m/s): means over the episodes that
 ended since the last row; coefficient and reward: means over steps; non_finite: episodes that
-were ended because the simulation became invalid."""
+were ended because the simulation became invalid; steps_per_second: without the first iteration of
+a call, which compiles."""
 
 CURVE_INTERVAL = 10
 """Iterations per row of the learning curve."""
 
 
-def _rows(path: Path) -> tuple[list[dict[str, str]], bool]:
+def read_rows(path: Path) -> tuple[list[dict[str, str]], bool]:
     """The rows of a learning curve as text, and whether others in the file are damaged.
 
-    A last row that a killed run left unfinished is left out and is no damage. No file, no rows.
+    A last row that a killed run left unfinished is left out and does not count as damage. Without
+    a file there are no rows.
     """
     if not path.exists():
         return [], False
@@ -39,7 +43,7 @@ def _rows(path: Path) -> tuple[list[dict[str, str]], bool]:
         return [], True
     # The end of a line is written last; without it, even the last number may be cut off.
     header, *lines = [_cells(line) for line in text.split("\n")[:-1]] or [[]]
-    # A file of another version may have other columns; what is no header at all is damaged.
+    # A file of another version may have other columns; what is not a header at all is damaged.
     known = "steps" in header and set(header) <= set(CURVE)
     names = header if known else CURVE
     rows = [dict(zip(names, x, strict=True)) if _is_row(x, names) else None for x in lines]
@@ -65,15 +69,19 @@ def _is_row(cells: list[str], names) -> bool:
     return steps.isascii() and steps.isdigit() and len(steps) < 20
 
 
-class _Curve:
+class Curve:
     """Averages over iterations, appended to a CSV file. Rows after the resumed step go.
 
     A damaged file is kept beside it, and its undamaged rows are used.
+
+    Args:
+        path: of the file.
+        steps: environment steps of the run that goes on.
     """
 
     def __init__(self, path: Path, steps: int):
         self.path = path
-        rows, damaged = _rows(path)
+        rows, damaged = read_rows(path)
         if damaged:
             kept = path.with_suffix(".damaged.csv")
             os.replace(path, kept)
@@ -81,19 +89,23 @@ class _Curve:
         rows = [row for row in rows if int(row["steps"]) <= steps]
         # Of rows that are there twice, the first.
         rows = list({int(row["steps"]): row for row in reversed(rows)}.values())[::-1]
-        text = io.StringIO(newline="")
-        writer = csv.DictWriter(text, CURVE)
-        writer.writeheader()
-        writer.writerows(rows)
-        atomic_write(path, text.getvalue())
+        atomic_write(path, curve_text(rows, CURVE))
         self.latest = {}
-        self.episodes = (0, 0.0, 0.0, 0.0)
         self._clear()
 
     def _clear(self):
         self.sums, self.count, self.ended = {}, 0, []
+        self.steps, self.seconds = 0, 0.0
 
-    def add(self, trajectory: Trajectory, metrics, seconds, batch):
+    def add(self, trajectory: Trajectory, metrics: dict, steps: int, seconds: float | None):
+        """Take an iteration into account.
+
+        Args:
+            trajectory: its rollout.
+            metrics: of its update.
+            steps: its environment steps.
+            seconds: how long it took; None if the time does not count, since it compiled.
+        """
         done = np.asarray(trajectory.terminated) | np.asarray(trajectory.truncated)
         columns = (
             trajectory.episode_return,
@@ -103,8 +115,6 @@ class _Curve:
         self.ended.append(np.stack([np.asarray(x)[done] for x in columns], -1))
         values = {
             **metrics,
-            "seconds": seconds,
-            "batch": batch,
             "coefficient": float(np.mean(trajectory.coefficient)),
             "reward": float(np.mean(trajectory.reward)),
             "non_finite": float(np.sum(~np.asarray(trajectory.finite))),
@@ -112,10 +122,12 @@ class _Curve:
         self.count += 1
         for name, value in values.items():
             self.sums[name] = self.sums.get(name, 0.0) + value
+        if seconds is not None:
+            self.steps, self.seconds = self.steps + steps, self.seconds + seconds
         # Where no episode has ended since the last row, the last ones that did are shown.
         self.latest = self.latest | self._row()
 
-    def _row(self):
+    def _row(self) -> dict[str, float]:
         row = {name: self.sums[name] / self.count for name in CURVE if name in self.sums}
         ended = np.concatenate(self.ended)
         if len(ended):
@@ -123,63 +135,122 @@ class _Curve:
                 zip(("return", "length", "tracking_error"), ended.mean(0).tolist(), strict=True)
             )
         row["non_finite"] = self.sums["non_finite"]
-        row["steps_per_second"] = self.sums["batch"] / max(self.sums["seconds"], 1e-9)
+        if self.steps:
+            row["steps_per_second"] = self.steps / max(self.seconds, 1e-9)
         return row
 
-    def write(self, steps, seconds):
-        row = {"steps": steps, "seconds": round(seconds, 1)}
-        row |= {
-            name: f"{value:.5g}"
-            for name, value in self._row().items()
-            if name in CURVE and name != "seconds"
-        }
+    def write(self, steps: int, seconds: float) -> None:
+        """Append the averages since the last row, if there are any.
+
+        steps, seconds: of the whole run so far.
+        """
+        if not self.count:
+            return
+        row = {name: f"{value:.5g}" for name, value in self._row().items()}
+        row |= {"steps": str(steps), "seconds": str(round(seconds, 1))}
+        line = ",".join(row.get(name, "") for name in CURVE)
         with names_path(self.path), self.path.open("a", newline="") as file:
-            csv.DictWriter(file, CURVE).writerow(row)
+            file.write(line + "\n")
         self._clear()
 
 
-class _Report:
-    """One progress line every few seconds, rewritten in place on a terminal.
+# ---------------------------------------------------------------------- the progress line
 
-    last: steps at which the call ends; until: time (`time.monotonic`) at which it does, if earlier.
+COMPILATION = {"native": 50, "mjx": 180}
+"""Seconds until the first iteration, on two CPU cores and nothing in the compilation cache; for the
+robots after the first, a quarter more each."""
+
+
+def announce(engine: str, robots: int, progress: bool) -> None:
+    """Say that compilation comes first, and about how long it takes."""
+    if progress:
+        seconds = COMPILATION.get(engine, COMPILATION["native"]) * (3 + robots) / 4
+        print(
+            f"compiling, about {seconds:.0f} s (less if it was compiled before on this machine)",
+            flush=True,
+        )
+
+
+class Progress:
+    """The progress of one call: a line that is rewritten in a terminal or notebook.
+
+    Where the output is neither, at most one line a minute is printed, and one at the end. Speed
+    and time left are measured from the second iteration on: the first one compiles.
+
+    Args:
+        last: environment steps at which the call ends.
+        until: time (`time.monotonic`) at which it does, if that is earlier.
+        active: whether anything is shown.
     """
 
-    def __init__(self, last: int, until: float, active: bool, interval: float = 5.0):
+    def __init__(self, last: int, until: float, active: bool):
         self.last, self.until, self.active = last, until, active
-        self.interactive = sys.stdout.isatty() or "ipykernel" in sys.modules
-        self.interval = interval if self.interactive else 12 * interval
-        self.next = 0.0
+        self.bar = None
 
-    def show(self, steps: int, curve: _Curve):
-        now = time.monotonic()
-        if not self.active or now < self.next:
+    def __enter__(self) -> "Progress":
+        return self
+
+    def __exit__(self, *_) -> None:
+        """Show the last state."""
+        if self.bar is not None:
+            self.bar.close()
+
+    def show(self, steps: int, curve: Curve) -> None:
+        """Note that the run has `steps` environment steps, and show it if it is time to."""
+        if not self.active:
             return
-        self.next = now + self.interval
-        row = curve.latest
-        left = (self.last - steps) / max(row["steps_per_second"], 1e-9)
-        left = max(min(left, self.until - now), 0.0)
-        ended = "no episode has ended yet"
+        if self.bar is None:
+            self.bar = _Bar(self.last, steps)
+        self.bar.set_description_str(self._text(steps, curve.latest), refresh=False)
+        self.bar.update(steps - self.bar.n)
+
+    def _text(self, steps: int, row: dict) -> str:
+        text = f"{steps:,} steps  no episode has ended yet"
         if "return" in row:
-            ended = f"return {row['return']:6.2f}  xy error {row['tracking_error']:.3f} m/s"
-        line = (
-            f"{steps:>12,} steps  {ended}  c {row['coefficient']:.2f}  "
-            f"{row['steps_per_second']:,.0f} steps/s  {_duration(left)} left"
+            text = (
+                f"{steps:,} steps  return {row['return']:.2f}  "
+                f"xy error {row['tracking_error']:.3f} m/s"
+            )
+        text += f"  c {row['coefficient']:.2f}"
+        times = self.bar.format_dict
+        done = steps - times["initial"]
+        if done and times["elapsed"]:
+            rate = done / times["elapsed"]
+            left = min((self.last - steps) / rate, self.until - time.monotonic())
+            text += f"  {rate:,.0f} steps/s  {tqdm.format_interval(max(left, 0.0))} left"
+        return text
+
+
+class _Bar(tqdm):
+    """tqdm's bar on stdout, as lines where that is neither a terminal nor a notebook."""
+
+    monitor_interval = 0  # no thread of its own, which would print more often
+
+    def __init__(self, total: int, initial: int):
+        interactive = sys.stdout.isatty() or "ipykernel" in sys.modules
+        super().__init__(
+            total=total,
+            initial=initial,
+            file=sys.stdout if interactive else _Lines(),
+            mininterval=1 if interactive else 60,
+            miniters=1,
+            maxinterval=math.inf,
+            bar_format="{percentage:3.0f}%|{bar:12}| {desc}" if interactive else "{desc}",
+            dynamic_ncols=interactive,
         )
-        print(
-            ("\r" if self.interactive else "") + line,
-            flush=True,
-            end="" if self.interactive else "\n",
-        )
-
-    def end(self):
-        if self.active and self.interactive:
-            print(flush=True)
 
 
-def _duration(seconds: float) -> str:
-    minutes = int(seconds // 60)
-    return (
-        f"{minutes // 60}h{minutes % 60:02d}"
-        if minutes >= 60
-        else f"{minutes}m{int(seconds) % 60:02d}"
-    )
+class _Lines:
+    """A file that makes lines of what tqdm writes over and over in one."""
+
+    def __init__(self):
+        self.last = ""
+
+    def write(self, text: str) -> None:
+        text = text.strip()
+        if text and text != self.last:
+            print(text)
+            self.last = text
+
+    def flush(self) -> None:
+        sys.stdout.flush()

@@ -1,8 +1,29 @@
-"""A run on disk: what it was begun with, and whether a configuration continues it."""
+"""A run on disk: what it was begun with, and whether a configuration continues it.
 
+The files of a run, in its folder:
+
+    training.safetensors  everything that determines its future
+    training.json         its configuration
+    training.csv          its learning curve
+
+One rule: a run is continued with its own configuration, and any other configuration is another run
+with another name. `train.continue_run` takes the configuration from training.json, and is the only
+way to override a setting.
+
+training.json is a list of phases, whose last one has the configuration of the run. There is more
+than one where settings were overridden, or where the run is a copy that is annealed. The first
+phase also has the hashes of the robots' files and the name of the engine.
+"""
+
+import os
+from collections.abc import Collection
 from dataclasses import replace
 from pathlib import Path
+from typing import Annotated
 
+from pydantic import Field
+
+from shapebody.agent.description import Phase
 from shapebody.agent.store import chosen_folder
 from shapebody.arguments import (
     require_engine,
@@ -10,33 +31,31 @@ from shapebody.arguments import (
     require_integer,
     require_kind,
     require_number,
-    shown,
+    require_path,
 )
-from shapebody.configuration import from_json, to_json
+from shapebody.configuration import configuration, from_json, to_json
 from shapebody.stored import read_json, read_number
 from shapebody.training.config import MOST_STEPS, TrainConfig, located, robot_name
 
+STATE, PHASES, CURVE = "training.safetensors", "training.json", "training.csv"
+STATE_FILES = (STATE, PHASES, CURVE)
 
-def _version(folder: Path):
-    """What changes whenever the state in a folder is written; None where there is none."""
-    try:
-        status = (folder / "training.safetensors").stat()
-        return status.st_ino, status.st_mtime_ns, status.st_size
-    except FileNotFoundError:
-        return None
+ANEW = f"restore it, or delete {STATE} beside it to begin anew"
+"""What to do about a damaged file of a run."""
 
 
-STATE_FILES = ("training.safetensors", "training.json", "training.csv")
-"""A run in its folder: its state, its configurations and its learning curve."""
+# ---------------------------------------------------------------------- arguments
 
 
-def _require_run(config, engine: str = "auto") -> None:
+def require_run(config, engine: str = "auto") -> None:
+    """TypeError if `config` is not a `TrainConfig`, ValueError for an unknown engine."""
     hint = 'for example TrainConfig.reduced("unitree_go2")'
     require_kind("config", config, TrainConfig, hint)
     require_engine("engine", engine)
 
 
-def _require_budget(max_steps, max_seconds, progress) -> None:
+def require_budget(max_steps, max_seconds, progress) -> None:
+    """ValueError if one of these arguments of a training is not what it should be."""
     if max_steps is not None:
         require_integer("max_steps", max_steps, 0, MOST_STEPS)
     if max_seconds is not None:
@@ -44,53 +63,38 @@ def _require_budget(max_steps, max_seconds, progress) -> None:
     require_flag("progress", progress)
 
 
-CHANGEABLE = (
-    "total_steps",
-    "epochs",
-    "minibatch_size",
-    "learning_rate",
-    "entropy_coefficient",
-    "value_lambda",
-    "cut_at_commands",
-    "state_bank",
-)
-"""Fields that may change when a run is continued; each change is recorded."""
-
-CHANGEABLE_INSIDE = {"policy": ("std_limits",), "task": ("horizon", "curriculum_length")}
-"""What may change inside other fields: the limits of the exploration noise, and the lengths of
-episodes (those that are under way keep theirs)."""
+# ---------------------------------------------------------------------- reading
 
 
-def as_continued(config: TrainConfig, folder=None) -> TrainConfig:
-    """The configuration of the run in the folder of `config`, if there is one to continue.
+def run_folder(name_or_folder: str | Path) -> Path:
+    """The folder of a run: data/checkpoints/<name>, or the folder that is given.
 
-    `config` itself if there is none, or one of other robots or of another scale. So a run goes on
-    with the settings that it was begun with, whatever the defaults are now. To change one that may
-    change (`CHANGEABLE`, `CHANGEABLE_INSIDE`), replace it in the result.
+    A Path, or a string with a path separator in it, is a folder; any other string is a name.
     """
-    _require_run(config)
-    folder = chosen_folder(folder, config.name)
-    if not (folder / "training.safetensors").exists():
-        return config
+    path = require_path("name_or_folder", name_or_folder)
+    text = str(name_or_folder)
+    if isinstance(name_or_folder, Path) or os.sep in text or "/" in text:
+        return path
+    return chosen_folder(None, text)
+
+
+def state_version(folder: Path):
+    """What changes whenever the state in a folder is written; None where there is none."""
     try:
-        last = from_json(TrainConfig, _phases(folder / "training.json")[-1].get("config"))
-    except (OSError, ValueError):
-        return config  # nothing to continue, or a damaged file, which `Trainer.start` reports
-
-    def identity(config):
-        return config.name, [robot_name(robot) for robot in config.robots], config.scale
-
-    # Their files may have moved; `Trainer.start` compares them with those of the run.
-    return replace(last, robots=config.robots) if identity(last) == identity(config) else config
+        status = (folder / STATE).stat()
+        return status.st_ino, status.st_mtime_ns, status.st_size
+    except FileNotFoundError:
+        return None
 
 
-ANEW = "restore it, or delete training.safetensors beside it to begin anew"
-"""What to do about a damaged file of a run."""
+def has_run(folder: Path) -> bool:
+    """Whether there is a run in a folder."""
+    return state_version(folder) is not None
 
 
-def _iterations(folder: Path) -> int:
-    """Finished iterations of the run in a folder."""
-    path = folder / "training.safetensors"
+def finished_iterations(folder: Path) -> int:
+    """Finished iterations of the run in a folder; ValueError if its state is damaged."""
+    path = folder / STATE
     fix = "restore it, or delete it to begin anew"
     number = read_number(path, "learner/iteration", fix)
     if number < 0:
@@ -98,45 +102,64 @@ def _iterations(folder: Path) -> int:
     return number
 
 
-def _phases(path: Path) -> list[dict]:
-    """The phases of a run, as its training.json holds them (`_continued`).
+@configuration
+class RunFile:
+    """The contents of training.json."""
+
+    phases: Annotated[list[Phase], Field(min_length=1)]
+
+
+def read_phases(folder: Path) -> list[dict]:
+    """The phases of the run in a folder, as its training.json holds them.
 
     Raises:
         FileNotFoundError: if the file is missing.
         ValueError: if it is damaged.
     """
     try:
-        phases = read_json(path, ANEW)
-        if not isinstance(phases, list) or not phases:
-            raise ValueError("it holds no phases")
-        kinds = {"config": dict, "from_step": int, "robots": dict, "engine": str}
-        for phase in phases:
-            if not isinstance(phase, dict):
-                raise ValueError("a phase is no object")
-            for name, kind in kinds.items():
-                if not isinstance(phase.get(name, kind()), kind):
-                    raise ValueError(f"{name} of a phase is of another kind than {kind.__name__}")
-            if phase.get("engine", "native") not in ("native", "mjx"):
-                raise ValueError(f"the engine is {shown(phase['engine'])}")
+        phases = read_json(folder / PHASES, ANEW)
+        from_json(RunFile, {"phases": phases}, PHASES)
     except ValueError as error:
         raise ValueError(
-            f"{path.name} is missing or damaged ({error}); it says how the run in {path.parent} "
-            f"was configured: {ANEW}"
+            f"{PHASES} is missing or damaged ({error}); it says how the run in {folder} was "
+            f"configured: {ANEW}"
         ) from error
     return phases
 
 
-def _engine(folder: Path, engine: str) -> str:
+def read_config(folder: Path) -> TrainConfig:
+    """The configuration of the run in a folder.
+
+    Settings that are newer than the run have their defaults.
+
+    Raises:
+        FileNotFoundError: if there is no run, or its training.json is missing.
+        ValueError: if that is damaged, or has settings that this version does not know.
+    """
+    if not has_run(folder):
+        raise FileNotFoundError(
+            f"there is no run in {folder}: {STATE} is missing; begin one with shapebody.train(...)"
+        )
+    try:
+        return from_json(TrainConfig, read_phases(folder)[-1].get("config"), "config")
+    except ValueError as error:
+        raise ValueError(
+            f"{PHASES} of the run in {folder} is damaged, or has settings that this version of "
+            f"shapebody does not know ({error}); continue it with the version that began it, or "
+            f"{ANEW}"
+        ) from error
+
+
+def run_engine(folder: Path, engine: str) -> str:
     """The engine for a run in a folder: that of the run there, or `engine` if there is none.
 
     Raises:
-        ValueError: if the run there has another engine than `engine`, which is not "auto".
+        ValueError: if the run there has another engine than `engine`, unless that is "auto".
     """
-    if not (folder / "training.safetensors").exists():
+    if not has_run(folder):
         return engine
     try:
-        # A run that does not say so is older than the record and native.
-        own = _phases(folder / "training.json")[0].get("engine", "native")
+        own = read_phases(folder)[0].get("engine", "native")
     except (OSError, ValueError):
         return engine  # a damaged file, which `Trainer.start` reports
     if engine not in ("auto", own):
@@ -148,53 +171,49 @@ def _engine(folder: Path, engine: str) -> str:
     return own
 
 
-def _continued(path: Path, config: TrainConfig, steps: int, robots=()) -> list[dict]:
-    """The phases of a run that goes on with `config`: a list of {"from_step", "config"}, the first
-    with hashes of the robots' files and the name of the engine.
+# ---------------------------------------------------------------------- continuing
+
+
+def continued_phases(
+    folder: Path, config: TrainConfig, steps: int, robots, changeable: Collection[str] = ()
+) -> list[dict]:
+    """The phases of the run in a folder, which goes on with `config` after `steps` steps.
+
+    Args:
+        folder: of the run.
+        config: its robots are `located`.
+        steps: environment steps that the run has taken.
+        robots: the robots of `config`. Files that have only moved are the same robots.
+        changeable: names of settings that may differ from those of the run; if one does, a phase
+            is added.
 
     Raises:
-        ValueError: if more than what is changeable, or a robot's file, differs from the run in
-            `path`.
+        FileNotFoundError: if training.json is missing.
+        ValueError: if another setting, or a robot's file, differs from those of the run, or
+            training.json is damaged.
     """
-    phases = _phases(path)
-    try:
-        # Settings that are newer than the run are at their defaults in it.
-        last = from_json(TrainConfig, phases[-1].get("config"), "config")
-    except ValueError as error:
-        raise ValueError(
-            f"{path.name} of the run in {path.parent} is damaged, or has settings that this "
-            f"version of shapebody does not know ({error}); continue it with the version that "
-            f"began it, or {ANEW}"
-        ) from error
-    before = to_json(replace(last, robots=tuple(located(robot) for robot in last.robots)))
-    known = phases[0].get("robots", {})
-    if [r.name for r in robots] == [robot_name(r) for r in last.robots] and all(
-        r.name in known for r in robots
-    ):
-        # Files that have only moved are the same robots: their hashes are compared below.
-        before["robots"] = list(config.robots)
-    now = to_json(config)
-    different = [name for name in now if before.get(name) != now[name]]
-    changeable = list(CHANGEABLE)
-    for field_name, inside in CHANGEABLE_INSIDE.items():
-        new = {name: now[field_name][name] for name in inside}
-        if before[field_name] | new == now[field_name]:
-            changeable.append(field_name)
-    other = [name for name in different if name not in changeable]
+    phases, last = read_phases(folder), read_config(folder)
+    if [robot_name(robot) for robot in last.robots] == [robot.name for robot in robots]:
+        last = replace(last, robots=config.robots)  # their hashes are compared below
+    else:
+        last = replace(last, robots=tuple(located(robot) for robot in last.robots))
+    before, now = to_json(last), to_json(config)
+    different = [name for name in now if before[name] != now[name]]
+    other = [name for name in different if name not in changeable or name == "robots"]
     if other:
-        text = "; ".join(_difference(name, before.get(name), now[name]) for name in other)
+        text = "; ".join(_difference(name, before[name], now[name]) for name in other)
         raise ValueError(
-            f"the run in {path.parent.name} has another configuration ({text}); continue it with "
-            "the old one, which as_continued(config) of shapebody.training.run_state returns, "
-            "choose another name, or delete its training.safetensors to begin anew"
+            f"the run in {folder.name} has another configuration ({text}); continue it with its "
+            f"own (train.continue_run, python -m shapebody continue {folder.name}), choose another "
+            f"name for this one, or delete {STATE} there to begin anew"
         )
-    _require_same_robots(known, robots, f"the run in {path.parent.name}")
+    require_same_robots(phases[0].get("robots", {}), robots, f"the run in {folder.name}")
     return phases + [{"from_step": steps, "config": now}] if different else phases
 
 
-def _require_same_robots(known: dict, robots, what: str) -> None:
+def require_same_robots(known: dict, robots, what: str) -> None:
     """ValueError if the file of a robot is not the one whose hash was recorded."""
-    changed = [r.name for r in robots if known.get(r.name, r.hash) != r.hash]
+    changed = [robot.name for robot in robots if known.get(robot.name, robot.hash) != robot.hash]
     if changed:
         raise ValueError(
             f"the file of robot {', '.join(changed)} has changed since {what} began, or is another "
@@ -203,6 +222,7 @@ def _require_same_robots(known: dict, robots, what: str) -> None:
 
 
 def _difference(name: str, old, new) -> str:
+    """How a setting differs, in words; of nested settings, each that does."""
     if isinstance(old, dict) and isinstance(new, dict):
         inside = [key for key in new if old.get(key) != new[key]]
         return "; ".join(_difference(f"{name}.{key}", old.get(key), new[key]) for key in inside)

@@ -1,28 +1,47 @@
 """Training runs from beginning to end: train, continue, anneal."""
 
+import dataclasses
 import json
 import os
 import secrets
 import shutil
+from collections.abc import Mapping
 from pathlib import Path
 
 from shapebody.agent.agent import Agent
-from shapebody.agent.store import chosen_folder, load_agent, read_metadata
-from shapebody.arguments import require_engine, require_flag, require_integer, require_number
+from shapebody.agent.store import load_agent
+from shapebody.arguments import (
+    require_engine,
+    require_flag,
+    require_integer,
+    require_kind,
+    require_number,
+)
 from shapebody.configuration import from_json
 from shapebody.files import atomic_write
 from shapebody.stored import read_json
 from shapebody.training.config import MOST_STEPS, TrainConfig
+from shapebody.training.progress import announce
+from shapebody.training.replacing import require_replaceable, steps_in
 from shapebody.training.run_state import (
+    CURVE,
+    PHASES,
+    STATE,
     STATE_FILES,
-    _engine,
-    _iterations,
-    _phases,
-    _require_budget,
-    _require_run,
-    as_continued,
+    finished_iterations,
+    has_run,
+    read_config,
+    read_phases,
+    require_budget,
+    require_run,
+    run_engine,
+    run_folder,
 )
 from shapebody.training.trainer import Trainer
+
+FIXED = ("name", "scale", "seed", "num_envs", "rollout_length")
+"""Settings of a run that cannot be overridden. Its numbers of steps and random numbers depend on
+them; sizes of networks cannot be either, since the arrays of the run have them."""
 
 
 def train(
@@ -37,17 +56,19 @@ def train(
 ) -> Agent | None:
     """Train an agent, or continue its training, and save it.
 
+    A run that was stopped is continued exactly where it was by the same configuration. Any other
+    configuration is another run, with another name or folder: `continue_run` continues a run whose
+    configuration is not at hand, and can override settings.
+
     An interrupt (Ctrl-C) ends the call early, with the agent of the last iteration; before the
     first one there is nothing to save, and KeyboardInterrupt is raised. A call that trains nothing,
     because the run is at its end or at `max_steps`, leaves an agent of at least as many steps in
     the folder as it is, with the critic that `train_critic` may have given it.
 
     Args:
-        config: the run, for example `TrainConfig.reduced("unitree_go2")`. If it is the default of
-            its scale, a run in the folder goes on with the settings that it has (`as_continued`).
-        folder: where the agent is kept; data/checkpoints/<name> by default. A run that was
-            stopped there is continued exactly where it was.
-        progress: print return, tracking error, curriculum coefficient, speed and time left.
+        config: the run, for example `TrainConfig.reduced("unitree_go2")`.
+        folder: where run and agent are kept; data/checkpoints/<name> by default.
+        progress: show return, tracking error, curriculum coefficient, speed and time left.
         max_steps: stop once this many steps in all have been consumed.
         max_seconds: stop after this many seconds. After either, the run can be continued.
         engine: "native", "mjx" or "auto", see `Trainer`.
@@ -60,81 +81,127 @@ def train(
 
     Raises:
         ValueError: if `max_steps` is less than one iteration, if the agent in the folder has more
-            steps than the run that is to go on, or if the run there cannot be continued with
-            `config`.
+            steps than the run that is to go on, or if the run there has another configuration (the
+            error lists the settings that differ).
     """
-    _require_run(config, engine)
-    _require_budget(max_steps, max_seconds, progress)
-    for name, value in (("state_only", state_only), ("replace", replace)):
-        require_flag(name, value)
-    given = {"robots": config.robots, "name": config.name}
-    if config == TrainConfig.at_scale(config.scale, config.robots[0], **given):
-        config = as_continued(config, folder)
+    require_run(config, engine)
+    _require_call(engine, progress, max_steps, max_seconds, state_only, replace)
+    return _train(config, folder, progress, (max_steps, max_seconds), engine, state_only, replace)
+
+
+def continue_run(
+    name_or_folder: str | Path,
+    overrides: Mapping | None = None,
+    progress: bool = True,
+    max_steps: int | None = None,
+    max_seconds: float | None = None,
+    engine: str = "auto",
+    state_only: bool = False,
+    replace: bool = False,
+) -> Agent | None:
+    """Continue a run with the configuration that it has, whatever the defaults are now.
+
+    Args:
+        name_or_folder: of the run. A Path, or a string with a path separator in it, is a folder;
+            any other string is a name in data/checkpoints.
+        overrides: settings by name that the run has from here on, such as
+            `{"learning_rate": (3e-5, 3e-5)}`; training.json records them as a new phase. A robot
+            whose file has moved is given as "robots".
+        progress, max_steps, max_seconds, engine, state_only, replace: see `train`.
+
+    Returns:
+        As `train`.
+
+    Raises:
+        FileNotFoundError: if there is no such run.
+        ValueError: as `train`, and if a setting cannot be overridden.
+    """
+    folder = run_folder(name_or_folder)
+    overrides = {} if overrides is None else overrides
+    _require_overrides(overrides)
+    _require_call(engine, progress, max_steps, max_seconds, state_only, replace)
+    config = dataclasses.replace(read_config(folder), **overrides)
+    budget = max_steps, max_seconds
+    return _train(config, folder, progress, budget, engine, state_only, replace, overrides)
+
+
+def _require_overrides(overrides) -> None:
+    """TypeError or ValueError if these are not settings that a run can change."""
+    require_kind("overrides", overrides, Mapping, "of settings by name")
+    free = [field.name for field in dataclasses.fields(TrainConfig) if field.name not in FIXED]
+    for name in overrides:
+        if name not in free:
+            raise ValueError(
+                f"overrides has {name!r}; expected settings of a run that can change "
+                f"({', '.join(free)}): begin a run under another name for others"
+            )
+
+
+def _require_call(engine, progress, max_steps, max_seconds, state_only, replace) -> None:
+    """ValueError if an argument of `train` or `continue_run` is not what it should be."""
+    require_engine("engine", engine)
+    require_budget(max_steps, max_seconds, progress)
+    require_flag("state_only", state_only)
+    require_flag("replace", replace)
+
+
+def _train(
+    config, folder, progress, budget, engine, state_only, replace, changeable=()
+) -> Agent | None:
+    """`train`, with settings that may differ from those of the run in the folder."""
+    max_steps, max_seconds = budget
     if max_steps is not None and max_steps < config.batch:
         raise ValueError(
             f"max_steps is {max_steps}; one iteration is {config.batch} steps: give at least as "
             "many, or a configuration with fewer environments"
         )
+    announce(engine, len(config.robots), progress)
     trainer = Trainer(config, folder, engine)
     # From reading the state to saving the agent: what another call has written meanwhile would be
     # lost.
     with trainer.alone():
-        trainer.start()
+        trainer.start(tuple(changeable))
         begun = trainer.steps
-        if not (state_only or replace) and begun < trainer.last_iteration(max_steps) * config.batch:
+        trains = begun < trainer.last_iteration(max_steps) * config.batch
+        if trains and not (state_only or replace):
             others = (
                 ", state_only=True (--state-only) to leave it, or choose another name or folder"
             )
-            _keep_agent(trainer.folder, begun, others)
-            _keep_critic(trainer.folder, others)
-        _run(trainer, progress, max_steps, max_seconds)
+            require_replaceable(trainer.folder, begun, others)
+        run_or_interrupt(trainer, progress, max_steps, max_seconds)
         if state_only:
             return None
-        if not replace and trainer.steps == begun <= (_agent_steps(trainer.folder) or 0):
+        if not replace and trainer.steps == begun <= (steps_in(trainer.folder) or 0):
             return load_agent(trainer.folder)
         return trainer.save_agent()
 
 
-def _metadata(folder: Path) -> dict | None:
-    """Metadata of the agent in a folder: None if there is no agent, {} if they are unreadable."""
+def run_or_interrupt(trainer: Trainer, progress, max_steps=None, max_seconds=None) -> None:
+    """Run a trainer until the end, a budget or an interrupt (Ctrl-C).
+
+    Raises KeyboardInterrupt if nothing was saved yet.
+    """
     try:
-        return read_metadata(folder)
-    except (ValueError, OSError):
-        return {}
+        trainer.run(max_steps, max_seconds, progress)
+    except KeyboardInterrupt:
+        saved = has_run(trainer.folder)
+        if progress and saved:
+            print("\ninterrupted: saved, the same call continues", flush=True)
+        elif progress:
+            print("\ninterrupted before the first iteration: nothing was saved", flush=True)
+        if not saved:
+            raise
+        # The learner may be an iteration ahead of the state on disk, where the next call begins.
+        trainer.start()
 
 
-def _agent_steps(folder: Path) -> int | None:
-    """Steps of the agent in a folder: None if there is no agent, 0 if it does not say."""
-    metadata = _metadata(folder)
-    return None if metadata is None else metadata.get("steps", 0)
-
-
-def _keep_agent(folder: Path, steps: int, others: str = "") -> None:
-    """Raise ValueError if the agent in a folder has more steps than the one to replace it."""
-    kept = _agent_steps(folder)
-    # A run that is about to begin replaces no agent, not even one of unknown steps.
-    if kept is not None and (kept > steps or steps == 0):
-        raise ValueError(
-            f"the agent in {folder} has {kept:,} steps, the run that would replace it {steps:,}; "
-            f"pass replace=True (--replace) to replace it{others}"
-        )
-
-
-def _keep_critic(folder: Path, others: str = "") -> None:
-    """Raise ValueError if the agent in a folder has a critic from policy evaluation."""
-    if "policy_evaluation" in (_metadata(folder) or {}):
-        raise ValueError(
-            f"the agent in {folder} has a critic from policy evaluation (sharpen), which the run "
-            "that would replace the agent does not have; pass replace=True (--replace) to replace "
-            f"it, and sharpen it again afterwards{others}"
-        )
+# ---------------------------------------------------------------------- annealing
 
 
 def anneal(
-    name: str,
+    name_or_folder: str | Path,
     steps: int = 1_640_000,
     last_rate: float = 2e-5,
-    folder=None,
     progress: bool = True,
     max_seconds: float | None = None,
     engine: str = "auto",
@@ -147,11 +214,10 @@ def anneal(
     agent is the copy's. The run itself stays where it is and can go on as fast as before.
 
     Args:
-        name: of the agent whose run is in data/checkpoints/<name>.
+        name_or_folder: of the run, as in `continue_run`. The agent is saved there, too; the copy
+            is in a folder in it until it is finished.
         steps: environment steps of the copy.
         last_rate: its learning rate at the end; linear from the run's present one.
-        folder: of the run, instead of data/checkpoints/<name>. The agent is saved there; the copy
-            is in a folder in it until it is finished.
         progress, max_seconds, engine: see `train`. A copy that was stopped is continued.
         replace: replace the agent in the folder even if it has more steps than the copy will have,
             or a critic from policy evaluation.
@@ -167,20 +233,22 @@ def anneal(
     require_integer("steps", steps, 1, MOST_STEPS)
     require_number("last_rate", last_rate, 0)
     require_engine("engine", engine)
-    _require_budget(None, max_seconds, progress)
+    require_budget(None, max_seconds, progress)
     require_flag("replace", replace)
-    folder = chosen_folder(folder, name)
+    folder = run_folder(name_or_folder)
     copy = folder / "annealed"
-    engine = _engine(folder, engine)
+    engine = run_engine(folder, engine)
     config = _begin_annealing(folder, copy, steps, last_rate, replace)
+    announce(engine, len(config.robots), progress)
     trainer = Trainer(config, copy, engine)
     with trainer.alone():
         trainer.start()
-        _run(trainer, progress, None, max_seconds)
+        run_or_interrupt(trainer, progress, max_seconds=max_seconds)
         if trainer.steps < config.iterations * config.batch:
             return None
         agent = trainer.save_agent(folder)
-        # By renaming it first: a copy of which a killed call has removed half would be no run.
+        # Renamed first: if this call is killed while it removes the copy, the rest of it must not
+        # look like a copy that can be continued.
         finished = folder / f".annealed.{secrets.token_hex(4)}.tmp"
         os.replace(copy, finished)
     for leftover in folder.glob(".annealed.*.tmp"):
@@ -197,13 +265,11 @@ def _begin_annealing(
     """
     missing = [file for file in STATE_FILES if not (folder / file).exists()]
     if missing:
-        raise ValueError(f"there is no run to anneal in {folder.name}: {missing[0]} is missing")
+        raise ValueError(f"there is no run to anneal in {folder}: {missing[0]} is missing")
     # The state is read first: curve rows that are newer than it do no harm.
-    state = (folder / STATE_FILES[0]).read_bytes()
-    done = _iterations(folder)
-    phases = _phases(folder / "training.json")
-    # Checked, but kept as it was written: the copy continues from it.
-    from_json(TrainConfig, phases[-1].get("config"), f"the configuration in {folder}/training.json")
+    state = (folder / STATE).read_bytes()
+    done, phases = finished_iterations(folder), read_phases(folder)
+    read_config(folder)  # a check: the copy's configuration is made of what was written
     config = dict(phases[-1]["config"])
     batch = config["num_envs"] * config["rollout_length"]
     first, last = config["learning_rate"]
@@ -222,35 +288,18 @@ def _begin_annealing(
         "learning_rate": [rate - slope * done, last_rate],
     }
     if not replace:
-        _keep_agent(folder, config["total_steps"])
-        _keep_critic(folder)
+        require_replaceable(folder, config["total_steps"])
     phases.append({"from_step": done * batch, "config": config})
-    if (copy / "training.safetensors").exists():
+    if has_run(copy):
         delete = "delete that folder to begin anew"
-        if read_json(copy / "training.json", delete) != phases:
+        if read_json(copy / PHASES, delete) != phases:
             raise ValueError(
                 f"{copy} is from an annealing that was stopped, of another step of the run or with "
                 "other steps or rate; delete that folder to begin anew"
             )
     else:
-        atomic_write(copy / "training.json", json.dumps(phases, indent=1) + "\n")
-        atomic_write(copy / "training.csv", (folder / "training.csv").read_bytes())
+        atomic_write(copy / PHASES, json.dumps(phases, indent=1) + "\n")
+        atomic_write(copy / CURVE, (folder / CURVE).read_bytes())
         # The state comes last: a copy without it is made again.
-        atomic_write(copy / "training.safetensors", state)
+        atomic_write(copy / STATE, state)
     return from_json(TrainConfig, config)
-
-
-def _run(trainer: Trainer, progress, max_steps, max_seconds) -> None:
-    """Run until the end, a budget or an interrupt; raise an interrupt before anything was saved."""
-    try:
-        trainer.run(max_steps, max_seconds, progress)
-    except KeyboardInterrupt:
-        saved = (trainer.folder / "training.safetensors").exists()
-        if progress and saved:
-            print("\ninterrupted: saved, the same call continues", flush=True)
-        elif progress:
-            print("\ninterrupted before the first iteration: nothing was saved", flush=True)
-        if not saved:
-            raise
-        # The learner may be an iteration ahead of the state on disk, where the next call begins.
-        trainer.start()

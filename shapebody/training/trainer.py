@@ -1,13 +1,8 @@
 """Training: PPO over randomized designs (Section 3.1, Appendix A), and policy evaluation.
 
-One iteration collects a rollout of every environment, computes advantages with the current
-critic, and takes several epochs of minibatch steps. A minibatch holds whole environments, so
-that a design is encoded once for all its steps.
-
-On a CPU, an actor thread collects the next rollout while the learner works on the last one.
-The actor's policy is then one update old. The loss accounts for that as decoupled PPO does:
-the trust region is around the policy at the start of the update, and the ratio of that policy
-to the actor's enters as a truncated importance weight.
+One iteration collects a rollout of every environment (`rollout.py`), computes advantages with the
+current critic, and takes several epochs of minibatch steps (`update.py`). A minibatch holds whole
+environments, so that a design is encoded once for all its steps.
 
 The second phase, policy evaluation, freezes the policy and trains critics alone on rollouts
 over the full design space.
@@ -17,8 +12,7 @@ import contextlib
 import json
 import math
 import time
-from collections.abc import Mapping
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Collection
 from dataclasses import replace
 
 import jax
@@ -26,7 +20,7 @@ import numpy as np
 
 from shapebody.agent.agent import Agent
 from shapebody.agent.store import chosen_folder, save_agent
-from shapebody.arguments import refuse, require_integer, require_path
+from shapebody.arguments import require_choice, require_integer, require_list, require_path
 from shapebody.configuration import to_json
 from shapebody.files import alone_in, atomic_write, load_arrays, save_arrays
 from shapebody.networks.critic import Critic
@@ -35,19 +29,22 @@ from shapebody.networks.policy import Policy
 from shapebody.robot.robot import load_robot
 from shapebody.runtime import keep_memory
 from shapebody.stored import ARRAYS_LIMIT
-from shapebody.task.env import Locomotion, Trajectory
+from shapebody.task.env import Locomotion
 from shapebody.training.config import MOST_STEPS, TrainConfig, located
-from shapebody.training.progress import CURVE_INTERVAL, _Curve, _Report, _rows
+from shapebody.training.progress import CURVE_INTERVAL, Curve, Progress, read_rows
+from shapebody.training.rollout import Actor, Failures, collect_states, make_policy_function
 from shapebody.training.run_state import (
-    STATE_FILES,
-    _continued,
-    _engine,
-    _iterations,
-    _require_budget,
-    _require_run,
-    _version,
+    CURVE,
+    PHASES,
+    STATE,
+    continued_phases,
+    finished_iterations,
+    require_budget,
+    require_run,
+    run_engine,
+    state_version,
 )
-from shapebody.training.update import make_policy_function, make_update
+from shapebody.training.update import init_learner, ppo_update, require_variables
 
 
 class Trainer:
@@ -73,9 +70,9 @@ class Trainer:
     """
 
     def __init__(self, config: TrainConfig, folder=None, engine: str = "auto", policy=None):
-        _require_run(config, engine)
-        if policy is not None and not (isinstance(policy, Mapping) and "params" in policy):
-            raise refuse("policy", policy, "variables of a Policy, such as agent.policy")
+        require_run(config, engine)
+        if policy is not None:
+            require_variables("policy", policy)
         keep_memory()
         robots = tuple(located(robot) for robot in config.robots)
         config = config if robots == config.robots else replace(config, robots=robots)
@@ -85,26 +82,26 @@ class Trainer:
         task = config.task
         if not config.learn_policy:
             task = replace(task, fixed_coefficient=True)
-        engine = _engine(self.folder, engine)
+        engine = run_engine(self.folder, engine)
         self.env = Locomotion(robots, config.num_envs, engine=engine, config=task)
         _check_state_bank(config, self.env.sizes)
+
+        # Networks, and the learner and actor that use them.
         self.policy, self.critic = Policy(config.policy), Critic(config.critic)
-        self.update, start = make_update(config, self.policy, self.critic)
-        self.act = make_policy_function(self.policy, config.mean_actions)
         keys = jax.random.split(jax.random.PRNGKey(config.seed), 4)
-        self.key = keys[0]
         constants = self._constants(keys[1]) if config.standardize else None
         if policy is None:
             policy = initialize(self.policy, keys[2], constants)
-        self.learner = start(policy, initialize(self.critic, keys[3], constants))
-        self.behaviour = self.learner.policy
+        self.learner = init_learner(config, policy, initialize(self.critic, keys[3], constants))
+        self.key = keys[0]
+        act = make_policy_function(self.policy, config.mean_actions)
+        self.actor = Actor(self.env, act, self.key, config.rollout_length)
+        self.actor.behaviour = self.learner.policy
+
         self.seconds = 0.0
         self.phases = []
-        self.state = None
-        self.saved_physics = None
-        self.in_step = True  # whether the engine is where `state` is
         self.holds_lock = False
-        self.known = None  # `_version` of the state on disk that this trainer read or wrote
+        self.known = None  # `state_version` of the state on disk that this trainer read or wrote
 
     def _constants(self, key):
         """Input standardization over the designs of all robots."""
@@ -122,12 +119,13 @@ class Trainer:
         """Environment steps the learner has consumed."""
         return int(self.learner.iteration) * self.config.batch
 
-    def _everything(self):
+    def everything(self) -> dict:
+        """What determines the run's future, as `training.safetensors` holds it."""
         return {
             "learner": self.learner,
-            "behaviour": self.behaviour,
-            "state": self.state,
-            "physics": self.saved_physics,
+            "behaviour": self.actor.behaviour,
+            "state": self.actor.state,
+            "physics": self.actor.physics,
             "seconds": np.float64(self.seconds),
         }
 
@@ -155,7 +153,7 @@ class Trainer:
 
     def _require_latest(self) -> None:
         """ValueError if the state on disk is another than this trainer read or wrote last."""
-        if _version(self.folder) != self.known:
+        if state_version(self.folder) != self.known:
             raise ValueError(
                 f"the run in {self.folder} has changed since this trainer read it: another one has "
                 "trained there; call start() to go on from its state, or choose another name or "
@@ -170,45 +168,49 @@ class Trainer:
         """
         with self.alone():
             self._require_latest()
-            path = self.folder / "training.json"
+            path = self.folder / PHASES
             text = json.dumps(self.phases, indent=1) + "\n"
             if not path.exists() or path.read_bytes() != text.encode():
                 atomic_write(path, text)
-            save_arrays(self.folder / STATE_FILES[0], self._everything())
-            self.known = _version(self.folder)
+            save_arrays(self.folder / STATE, self.everything())
+            self.known = state_version(self.folder)
 
-    def start(self) -> bool:
+    def start(self, changeable: Collection[str] = ()) -> bool:
         """Resume from the folder, or start afresh; True if resumed.
+
+        Args:
+            changeable: names of settings in which the configuration may differ from that of the
+                run in the folder; if it does, the next save records it as a new phase.
 
         Raises:
             FileNotFoundError: if the run in the folder lacks its training.json.
-            ValueError: if the run in the folder is of another configuration, or its files are
+            ValueError: if the run in the folder has another configuration, or its files are
                 damaged.
         """
-        path = self.folder / "training.safetensors"
+        changeable = require_list("changeable", changeable)
+        for name in changeable:
+            require_choice("an entry of changeable", name, vars(self.config))
         # Before anything is read: what another trainer writes meanwhile is noticed in `run`.
-        self.known = _version(self.folder)
-        resumed = path.exists()
+        self.known = state_version(self.folder)
+        resumed = self.known is not None
         if resumed:
             # Before the arrays are read, whose shapes depend on the configuration.
-            steps = _iterations(self.folder) * self.config.batch
-            about = self.folder / "training.json"
-            self.phases = _continued(about, self.config, steps, self.env.robots)
-        coefficient = 0.0 if self.config.learn_policy else 1.0
-        self.state = self.env.reset(self.key, coefficient=coefficient, spread=True)
-        native = self.env.engine == "native"
-        self.saved_physics = self.env.physics_arrays() if native else self.env.physics_state
+            steps = finished_iterations(self.folder) * self.config.batch
+            self.phases = continued_phases(
+                self.folder, self.config, steps, self.env.robots, changeable
+            )
+        self.actor.reset(0.0 if self.config.learn_policy else 1.0)
         if not resumed:
             robots = {robot.name: robot.hash for robot in self.env.robots}
             first = {"from_step": 0, "config": to_json(self.config)}
             self.phases = [first | {"robots": robots, "engine": self.env.engine}]
             return False
-        saved = load_arrays(path, self._everything())
-        self.learner, self.behaviour = saved["learner"], saved["behaviour"]
-        self.state, self.seconds = saved["state"], float(saved["seconds"])
-        self.saved_physics = saved["physics"]
-        self.in_step = False
+        saved = load_arrays(self.folder / STATE, self.everything())
+        self.learner, self.seconds = saved["learner"], float(saved["seconds"])
+        self.actor.resume(saved["behaviour"], saved["state"], saved["physics"])
         return True
+
+    # -------------------------------------------------------------- the agent
 
     def agent(self, states=None) -> Agent:
         """The agent as trained so far."""
@@ -241,15 +243,33 @@ class Trainer:
         """
         folder = self.folder if folder is None else require_path("folder", folder)
         agent = self.agent(self.state_bank())
-        rows, _ = _rows(self.folder / "training.csv")
+        rows, _ = read_rows(self.folder / CURVE)
         save_agent(agent, folder, rows or None)
         return agent
 
-    # -------------------------------------------------------------- the loop
+    def state_bank(self, rollouts: int = 8):
+        """States from rollouts of the policy on random designs at c = 1 (`collect_states`).
 
-    def _collect(self, behaviour, state, number):
-        key = jax.random.fold_in(self.key, 2 * number)
-        return self.env.rollout(self.act, behaviour, state, key, self.config.rollout_length)
+        Designs and episodes are those of the task: the policy-evaluation phase, from which the
+        shipped banks come, has f ~ U([-r, r]^d) with r ~ U(0, 1) and short episodes.
+
+        Returns (Observation [M, ...] of numpy arrays, robot index int32[M]); None if the
+        simulation fails in every step.
+        """
+        require_integer("rollouts", rollouts, 1, 100_000)
+        config = self.config
+        return collect_states(
+            self.env,
+            self.actor.act,
+            self.learner.policy,
+            self.key,
+            length=config.rollout_length,
+            count=config.state_bank,
+            rollouts=rollouts,
+            seed=config.seed,
+        )
+
+    # -------------------------------------------------------------- the loop
 
     def last_iteration(self, max_steps=None) -> int:
         """Number of finished iterations at which `run` ends with that budget."""
@@ -264,145 +284,56 @@ class Trainer:
         Args:
             max_steps: stop once this many steps in all have been consumed.
             max_seconds: stop after this many seconds of this call.
-            progress: print a line every few seconds.
+            progress: show return, tracking error, curriculum coefficient, speed and time left.
             curve_interval: iterations per row of the learning curve, CURVE_INTERVAL if not given.
 
         Raises:
             ValueError: if another process trains in the same folder, or has trained there since
                 `start`; if the simulation of a robot always fails.
         """
-        _require_budget(max_steps, max_seconds, progress)
+        require_budget(max_steps, max_seconds, progress)
         if curve_interval is not None:
             require_integer("curve_interval", curve_interval, 1)
-        config = self.config
         number, last = int(self.learner.iteration), self.last_iteration(max_steps)
         if number >= last:
             return
-        if not self.in_step:
-            if self.env.engine == "native":
-                self.env.restore(self.state, self.saved_physics)
-            else:
-                self.env.physics_state = self.saved_physics
-        self.in_step = False
-        # On an accelerator there is nothing to overlap: the device does one thing at a time.
-        overlap = self.env.engine == "native"
-        failures = Failures(self.env)
-        with self.alone(), ThreadPoolExecutor(1) as actor:
+        batch, failures = self.config.batch, Failures(self.env)
+        with self.alone(), self.actor as actor:
             self._require_latest()
-            curve = _Curve(self.folder / "training.csv", self.steps)
-            state, trajectory = self._collect(self.behaviour, self.state, number)
+            curve = Curve(self.folder / CURVE, self.steps)
+            trajectory, compiling = actor.repeat(number), True
             mark = time.monotonic()
             until = mark + (math.inf if max_seconds is None else max_seconds)
-            report = _Report(last * config.batch, until, progress)
-            while True:
-                # A snapshot from which the rollout below can be repeated.
-                self.state, self.behaviour = state, self.learner.policy
-                if overlap:
-                    self.saved_physics = self.env.physics_arrays()
-                    pending = actor.submit(self._collect, self.behaviour, state, number + 1)
-                key = jax.random.fold_in(self.key, 2 * number + 1)
-                self.learner, metrics = self.update(self.learner, trajectory, key)
-                metrics = {name: float(x) for name, x in metrics.items()}
-                if overlap:
-                    state, following = pending.result()
-                else:
-                    self.behaviour = self.learner.policy
-                    self.saved_physics = self.env.physics_state
-                number += 1
-                now = time.monotonic()
-                self.seconds, elapsed, mark = self.seconds + now - mark, now - mark, now
-                failures.add(trajectory)
-                curve.add(trajectory, metrics, elapsed, config.batch)
-                if number % (curve_interval or CURVE_INTERVAL) == 0:
-                    curve.write(self.steps, self.seconds)
-                report.show(self.steps, curve)
-                self.save()
-                if number >= last or now >= until:
-                    break
-                if not overlap:
-                    state, following = self._collect(self.behaviour, state, number)
-                trajectory = following
-        if curve.count:
-            curve.write(self.steps, self.seconds)
-        report.end()
+            with Progress(last * batch, until, progress) as report:
+                while True:
+                    metrics = self._iteration(trajectory, number)
+                    number += 1
+                    now = time.monotonic()
+                    self.seconds, elapsed, mark = self.seconds + now - mark, now - mark, now
+                    failures.add(trajectory)
+                    curve.add(trajectory, metrics, batch, None if compiling else elapsed)
+                    if number % (curve_interval or CURVE_INTERVAL) == 0:
+                        curve.write(self.steps, self.seconds)
+                    report.show(self.steps, curve)
+                    self.save()
+                    if number >= last or now >= until:
+                        break
+                    trajectory, compiling = actor.result(), False
+        curve.write(self.steps, self.seconds)
 
-    def state_bank(self, rollouts: int = 8):
-        """States from rollouts of the policy on random designs at c = 1 (Section 3.2).
-
-        Designs and episodes are those of the task: the policy-evaluation phase, from which the
-        shipped banks come, has f ~ U([-r, r]^d) with r ~ U(0, 1) and short episodes.
-
-        Returns (Observation [M, ...] of numpy arrays, robot index int32[M]); None if the
-        simulation fails in every step. Rollouts that fail so are left out.
-        """
-        require_integer("rollouts", rollouts, 1, 100_000)
-        count = self.config.state_bank
-        env = self.env
-        if not env.config.fixed_coefficient:
-            # In the training environment, c would fall on bodies that the policy cannot move.
-            env = env.with_task(replace(env.config, fixed_coefficient=True))
-        self.in_step = False
-        state = env.reset(jax.random.fold_in(self.key, 1), coefficient=1.0, spread=True)
-        length = self.config.rollout_length
-        parts, robots, per = [], [], -(-count // rollouts)
-        owner = np.concatenate([np.full(g.count, i) for i, g in enumerate(env.groups)])
-        skip = max(1, 64 // length)
-        rng = np.random.default_rng(self.config.seed)
-        for r in range(rollouts):
-            # Rollouts far apart, so that states come from many moments of an episode.
-            for s in range(skip):
-                key = jax.random.fold_in(self.key, 1_000_003 + r * skip + s)
-                state, trajectory = env.rollout(self.act, self.learner.policy, state, key, length)
-            good = np.argwhere(np.asarray(trajectory.finite))
-            if not len(good):
-                continue
-            t, n = good[rng.choice(len(good), per, replace=per > len(good))].T
-            parts.append(
-                jax.tree.map(lambda x, t=t, n=n: np.asarray(x)[t, n], trajectory.observation)
-            )
-            robots.append(owner[n])
-        if not parts:
-            return None
-        bank = jax.tree.map(lambda *x: np.concatenate(x)[:count].astype(np.float32), *parts)
-        return bank, np.concatenate(robots)[:count].astype(np.int32)
-
-
-class Failures:
-    """Watches rollouts for robots whose simulation always fails: nothing can be learned there."""
-
-    LEAST = 16
-    """Failed episodes without one that ends otherwise, at least; and one per environment."""
-
-    def __init__(self, env: Locomotion):
-        self.names = [robot.name for robot in env.robots]
-        counts = [group.count for group in env.groups]
-        self.owner = np.repeat(np.arange(len(counts)), counts)
-        self.limits = np.maximum(counts, self.LEAST)
-        self.failed = np.zeros(len(counts), int)
-
-    def add(self, trajectory: Trajectory) -> None:
-        """Count the episodes that ended in a rollout.
-
-        Raises:
-            ValueError: if all latest episodes of a robot ended with a simulation that is not
-                finite, as many as it has environments and at least LEAST.
-        """
-        finite = np.asarray(trajectory.finite)
-        ended = np.asarray(trajectory.terminated) | np.asarray(trajectory.truncated)
-
-        def per_robot(which):
-            return np.bincount(self.owner, which.sum(0), len(self.failed)).astype(int)
-
-        sound = per_robot(ended & finite) > 0
-        self.failed = np.where(sound, 0, self.failed + per_robot(~finite))
-        for name, failed, limit in zip(self.names, self.failed, self.limits, strict=True):
-            if failed >= limit:
-                raise ValueError(
-                    f"the simulation of robot {name!r} fails in every episode: its positions or "
-                    f"velocities became infinite in {failed} of the last {failed} episodes, so "
-                    "there is nothing to learn from; check the file (shapebody.validate_robot), "
-                    "above all gains, masses, inertias and armature, or give it a smaller timestep"
-                )
+    def _iteration(self, trajectory, number: int) -> dict[str, float]:
+        """Learn from rollout `number` and begin the next one; returns the update's metrics."""
+        actor = self.actor
+        if actor.beside:
+            # With the policy before the update, so that both work at the same time.
+            actor.begin(self.learner.policy, number + 1)
+        key = jax.random.fold_in(self.key, 2 * number + 1)
+        self.learner, metrics = ppo_update(self.config, self.learner, trajectory, key)
+        metrics = {name: float(x) for name, x in metrics.items()}
+        if not actor.beside:
+            actor.begin(self.learner.policy, number + 1)
+        actor.wait()
+        return metrics
 
 
 def _check_state_bank(config: TrainConfig, sizes) -> None:

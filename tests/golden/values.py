@@ -30,7 +30,7 @@ from shapebody.task.observations import COMMAND, Observation, sphere_collisions
 from shapebody.task.rewards import TERMS, Moment, combine, reward_terms
 from shapebody.training.config import TrainConfig
 from shapebody.training.losses import advantages
-from shapebody.training.update import make_update
+from shapebody.training.update import init_learner, ppo_update
 
 FOLDER = Path(__file__).parent
 GO2, HUMANOID, GOLEM = "unitree_go2", "mit_humanoid", "golem"
@@ -301,11 +301,12 @@ def update() -> dict:
     rollout = _rollout(config, load_robot(GO2))
     policy, critic = Policy(config.policy), Critic(config.critic)
     constants = standardization(jax.tree.map(lambda x: x[0], rollout.descriptions))
-    step, start = make_update(config, policy, critic)
     keys = jax.random.split(jax.random.PRNGKey(4), 3)
-    learner = start(initialize(policy, keys[0], constants), initialize(critic, keys[1], constants))
+    learner = init_learner(
+        config, initialize(policy, keys[0], constants), initialize(critic, keys[1], constants)
+    )
     values = named_leaves({"policy": learner.policy, "critic": learner.critic}, "before ")
-    learner, metrics = step(learner, rollout, keys[2])
+    learner, metrics = ppo_update(config, learner, rollout, keys[2])
     values |= named_leaves({"policy": learner.policy, "critic": learner.critic}, "after ")
     values |= {f"metric {name}": np.asarray(x)[None] for name, x in metrics.items()}
     return summarized(values)
