@@ -10,7 +10,6 @@ from arguments import (
     AGENT,
     AGENT_FOLDER,
     ANGLE,
-    ANSWER,
     AXES,
     CONFIDENCE,
     COUNT,
@@ -136,7 +135,6 @@ UNCHECKED = {
     "optimizers.objective.DesignCritic.__call__": "called by `Objective`, inside compiled code",
     "optimizers.objective.Objective": "made by `Objective.of`",
     "robot.report.Report": RESULT,
-    "notebooks.main": "the command line, see the other test",
 }
 UNCHECKED |= {
     "design.phi.phi": FORMULA,
@@ -382,32 +380,6 @@ FUNCTIONS = {
         resamples=integer(1, 10**6),
         seed=SEED,
     ),
-    "exercises.check_cem_generation": dict(function=ANSWER),
-    "exercises.check_climb": dict(propose=ANSWER, update=ANSWER),
-    "exercises.check_covered": dict(function=ANSWER, trajectory=array(3, 1, 2, accepts=("array",))),
-    "exercises.check_gae": dict(function=ANSWER),
-    "exercises.check_growth": dict(answer=ANSWER),
-    "exercises.check_heavier": dict(f=ANSWER, space=SPACE, kilograms=FINITE),
-    "exercises.check_held_out": dict(
-        answer=ANSWER, gains=array(2, 4, accepts=("JAX array",)), trust_regions=array(2)
-    ),
-    "exercises.check_knee_torque": dict(answer=ANSWER, robot=ROBOT),
-    "exercises.check_largest_step": dict(
-        answer=ANSWER, result=thing(lambda world: world.search_result)
-    ),
-    "exercises.check_pair_distance": dict(function=ANSWER),
-    "exercises.check_penalty_coefficient": dict(function=ANSWER),
-    "exercises.check_per_motor": dict(answer=ANSWER),
-    "exercises.check_radius": dict(function=ANSWER, dim=COUNT),
-    "exercises.check_reward": dict(function=ANSWER),
-    "exercises.check_step": dict(function=ANSWER, max_update=POSITIVE),
-    "exercises.check_successes": dict(answer=ANSWER, levels=COUNT),
-    "exercises.check_surrogate": dict(function=ANSWER, clip_range=PROBABILITY),
-    "exercises.check_total_mass": dict(
-        function=ANSWER.given(lambda world: lambda x: x), space=SPACE
-    ),
-    "exercises.check_trust_regions": dict(results=ANSWER),
-    "exercises.check_twelve_motors": dict(path=ANSWER),
     "reproduction.scale.agent_name": dict(robot=NAME),
     "reproduction.pictures.before_after": dict(
         agent=AGENT,
@@ -602,10 +574,6 @@ FUNCTIONS = {
     "networks.inputs.standardization": dict(
         descriptions=DESCRIBED, floor=POSITIVE, constant=AT_LEAST_0
     ),
-    "notebooks.execute": dict(path=thing(lambda world: world.notebook), timeout=optional(POSITIVE)),
-    "notebooks.normalise": dict(notebook=thing(lambda world: None)),
-    "notebooks.parser": {},
-    "notebooks.problems": dict(path=thing(lambda world: world.notebook)),
     "reproduction.paper.trust_region_gain": dict(robot=TEXT, trust_region=AT_LEAST_0),
     "files.data_dir": {},
     "physics.protocol.prepare": dict(
