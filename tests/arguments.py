@@ -316,16 +316,6 @@ def _(world):
     return Renderer(world.robot.model, 32, 32, opengl=False)
 
 
-@makes("live", "show.scene.LiveScene")
-def _(world):
-    """Without the viewer, which starts a server."""
-    from shapebody.show.scene import LiveScene
-
-    live = object.__new__(LiveScene)
-    live.space, live._parts = world.space, None
-    return live
-
-
 @makes("scene", "show.scene.Scene")
 def _(world):
     from shapebody.show.scene import Scene
