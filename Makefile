@@ -1,11 +1,12 @@
-# make lab: everything from nothing to open notebooks.   make test: the same set-up, then all tests.
+# make demo: from nothing to a better robot.   make lab: to open notebooks.   make test: to all tests.
 
 VENV := .venv
 PY := $(VENV)/bin/python
 SCALE ?= reduced
 NOTEBOOKS ?= $(wildcard notebooks/*.ipynb)
 LAB_ARGS ?=
-PYTEST_ARGS ?=
+# Two workers share one cache of compiled programs; a file stays with one worker.
+PYTEST_ARGS ?= -n 2 --dist loadfile
 
 # A robotics shell often sets PYTHONPATH, and its packages would shadow the locked ones.
 unexport PYTHONPATH
@@ -13,10 +14,11 @@ unexport PYTHONHOME
 # The kernel of this environment wins over one in the home folder.
 export JUPYTER_PREFER_ENV_PATH := 1
 
-.PHONY: help venv lab test notebooks lint bench lock clean
+.PHONY: help venv demo lab test notebooks lint bench lock clean
 
 help:
-	@echo "make lab         create $(VENV) from environment.lock and open the notebooks in JupyterLab"
+	@echo "make demo        create $(VENV) from environment.lock and design a better Go2, in minutes"
+	@echo "make lab         create the same and open the notebooks in JupyterLab"
 	@echo "make test        create the same, run the unit tests and every notebook at scale smoke"
 	@echo "make venv        only create $(VENV)"
 	@echo "make notebooks   execute and save all notebooks   (SCALE=smoke|reduced|full, NOTEBOOKS=...)"
@@ -30,6 +32,9 @@ help:
 # each time, in half a second, as an interpreter or a package can be gone after an upgrade.
 venv:
 	@sh .ci/make_venv.sh $(VENV)
+
+demo: venv
+	$(PY) tools/demo.py
 
 lab: venv
 	$(PY) -m jupyterlab --ServerApp.root_dir=. --LabApp.default_url=/lab/tree/notebooks \

@@ -1,186 +1,270 @@
-"""Command line: python -m shapebody train | anneal | sharpen | design | evaluate | validate."""
+"""Command line: python -m shapebody COMMAND ..., with --help for each of them.
 
-import argparse
+Every setting of a configuration can be given: `train unitree_go2 --task.horizon 500`. The functions
+below are built when their command is asked for, so that none waits for what only others import.
+"""
+
+import dataclasses
 import os
 import sys
+from pathlib import Path
+from typing import Annotated, Literal
+
+Engine = Literal["auto", "native", "mjx"]
 
 # Actor and learner share the cores of a CPU; XLA's own thread pool would get in their way.
 # It must be said before JAX starts.
 _FLAG = "--xla_cpu_multi_thread_eigen=false"
 
-_REPLACE = "replace the saved agent even if it has more steps, or a critic made by sharpen"
-
-
-def parser() -> argparse.ArgumentParser:
-    """The commands and their options."""
-    parser = argparse.ArgumentParser(prog="python -m shapebody", description=__doc__)
-    commands = parser.add_subparsers(dest="command", required=True)
-
-    train = commands.add_parser("train", help="train an agent, or continue its training")
-    train.add_argument("robots", nargs="+", help="names in data/robots, or MJCF files")
-    train.add_argument("--name", help="name of the agent (default: the robot's)")
-    train.add_argument("--scale", choices=("smoke", "reduced", "full"), help="default: reduced")
-    train.add_argument("--hours", type=float, help="stop after this time; run again to continue")
-    train.add_argument("--steps", type=int, help="stop at this many environment steps in all")
-    train.add_argument(
-        "--state-only", action="store_true", help="leave the saved agent as it is; anneal later"
-    )
-    train.add_argument("--replace", action="store_true", help=_REPLACE)
-
-    anneal = commands.add_parser(
-        "anneal", help="save an agent from an unfinished run, after a last part at a falling rate"
-    )
-    anneal.add_argument("agent")
-    anneal.add_argument("--steps", type=int, default=1_640_000, help="of that part")
-    anneal.add_argument("--hours", type=float, help="stop after this time; run again to continue")
-    anneal.add_argument("--replace", action="store_true", help=_REPLACE)
-
-    sharpen = commands.add_parser(
-        "sharpen", help="policy evaluation: a new critic for an agent's frozen policy"
-    )
-    sharpen.add_argument("agent")
-    sharpen.add_argument("--steps", type=int, help="12 %% of those of training if not given")
-    sharpen.add_argument("--hours", type=float, help="stop after this time; run again to continue")
-
-    sharpen.add_argument(
-        "--task-of",
-        choices=("evaluation", "training"),
-        default="evaluation",
-        help="which task the critic learns: that of the evaluation of designs (default), or that "
-        "of the policy's training",
-    )
-
-    design = commands.add_parser("design", help="search for a better body")
-    design.add_argument("robot", help="name in data/robots, or an MJCF file")
-    design.add_argument("--agent", help="default: the agent named as the robot")
-    design.add_argument("--method", default="vgds")
-    design.add_argument("--start", type=int, help="start design number (default: the reference)")
-    design.add_argument("--seed", type=int, default=0)
-    design.add_argument("--trust-region", type=float, default=100.0, help="lambda (default 100)")
-    design.add_argument(
-        "--freeze",
-        nargs="*",
-        default=["size"],
-        metavar="NAME",
-        help="parameters that stay as they are (default: size, the scale of the whole body; "
-        "alone, it frees all, as in the paper)",
-    )
-    design.add_argument("--out", help="write the found body to this MJCF file")
-
-    evaluate = commands.add_parser("evaluate", help="return and tracking error of an agent")
-    evaluate.add_argument("agent")
-    evaluate.add_argument("--robot", help="default: the agent's first robot")
-    evaluate.add_argument("--start", type=int, help="start design number (default: the reference)")
-    evaluate.add_argument("--episodes", type=int, default=200)
-    evaluate.add_argument("--seed", type=int, default=0, help="of the episodes")
-
-    validate = commands.add_parser("validate", help="what the method sees in a robot file")
-    validate.add_argument("robot", help="an MJCF or URDF file, or a name in data/robots")
-    validate.add_argument("--out", help="write the completed file to this MJCF file")
-
-    for command in (train, anneal, sharpen, evaluate):
-        command.add_argument("--engine", choices=("auto", "native", "mjx"), default="auto")
-
-    return parser
-
 
 def main(arguments=None) -> int:
     """Run a command; returns its exit status. Errors are one line on stderr."""
-    options = parser().parse_args(arguments)
-    if options.command in ("train", "anneal", "sharpen"):
+    words = list(sys.argv[1:] if arguments is None else arguments)
+    if not words or words[0] not in COMMANDS:
+        asked = bool(words) and words[0] in ("-h", "--help")
+        wrong = "" if asked or not words else f"shapebody: no command {words[0][:80]!r}\n"
+        print(wrong + _usage(), file=sys.stdout if asked else sys.stderr)
+        return 0 if asked else 2
+    name, words = words[0], words[1:]
+    if name in ("train", "continue", "anneal", "policy-evaluation"):
         os.environ["XLA_FLAGS"] = f"{os.environ.get('XLA_FLAGS', '')} {_FLAG}".strip()
     try:
-        if options.command == "validate":
-            return _validate(options)
-        from shapebody.runtime import enable_compilation_cache
+        import tyro
 
-        enable_compilation_cache()
-        {
-            "train": _train,
-            "anneal": _anneal,
-            "sharpen": _sharpen,
-            "design": _design,
-            "evaluate": _evaluate,
-        }[options.command](options)
+        # Markers say which arguments are positional, so that the commands need no tyro.
+        command, words = COMMANDS[name](words)
+        prog = f"python -m shapebody {name}"
+        return tyro.cli(command, prog=prog, args=words) or 0
     except (ValueError, OSError, ImportError) as error:
         print(f"shapebody: {error}", file=sys.stderr)
         return 1
     except KeyboardInterrupt:
         print("shapebody: interrupted", file=sys.stderr)
         return 130
-    return 0
 
 
-def _train(options):
+def _usage() -> str:
+    width = max(map(len, COMMANDS))
+    lines = [f"  {name:{width}}  {make.__doc__}" for name, make in COMMANDS.items()]
+    return "usage: python -m shapebody COMMAND [--help] ...\n\n" + "\n".join(lines)
+
+
+# ------------------------------------------------------------------ commands
+
+
+def _train(words):
+    """train an agent from nothing, on one robot or several"""
+    import tyro
+
     from shapebody.reproduction.scale import scale
     from shapebody.training.config import TrainConfig
-    from shapebody.training.run_state import as_continued
-    from shapebody.training.train import train
 
-    changes = {"robots": tuple(options.robots)}
-    if options.name is not None:
-        changes["name"] = options.name
-    config = TrainConfig.at_scale(options.scale or scale(), options.robots[0], **changes)
-    config, seconds = as_continued(config), _seconds(options)
-    agent = train(
-        config,
-        max_steps=options.steps,
-        max_seconds=seconds,
-        engine=options.engine,
-        state_only=options.state_only,
-        replace=options.replace,
+    count = next((i for i, word in enumerate(words) if word.startswith("-")), len(words))
+    robots, words = words[:count], words[count:]
+    if not robots and not {"-h", "--help"} & set(words):
+        raise ValueError("train needs a robot: a name in data/robots, or an MJCF or URDF file")
+    chosen = _value_of("--scale", words) or scale()
+    default = TrainConfig.at_scale(
+        chosen, (robots or ["ROBOT"])[0], robots=tuple(robots or ["ROBOT"])
     )
-    if agent is not None:
-        print(f"agent {agent.name}: {agent.metadata['steps']:,} steps")
+
+    def train(
+        settings: Annotated[TrainConfig, tyro.conf.arg(name="")] = default,
+        hours: float | None = None,
+        steps: int | None = None,
+        state_only: bool = False,
+        replace: bool = False,
+        engine: Engine = "auto",
+    ):
+        """Train an agent: python -m shapebody train ROBOT [ROBOT ...] [--scale reduced] ...
+
+        A run that is in the agent's folder already is continued if its settings are the same.
+
+        Args:
+            settings: of the run.
+            hours: stop after this time; run again to continue.
+            steps: stop at this many environment steps in all.
+            state_only: leave the saved agent as it is; `anneal` makes one later.
+            replace: replace the saved agent even if it has more steps or a critic of its own.
+            engine: native is MuJoCo in C, mjx is JAX; auto: native on a CPU.
+        """
+        from shapebody.training.train import train
+
+        agent = train(
+            settings,
+            max_steps=steps,
+            max_seconds=_seconds(hours),
+            engine=engine,
+            state_only=state_only,
+            replace=replace,
+        )
+        _tell(agent)
+
+    _prepare()
+    return train, words
 
 
-def _seconds(options) -> float | None:
-    """--hours in seconds."""
-    from shapebody.arguments import require_number
+def _continue(words):
+    """continue a training run with the settings that it has"""
+    import tyro
 
-    return None if options.hours is None else 3600 * require_number("--hours", options.hours, 0)
+    def continue_run(
+        agent: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="AGENT")],
+        hours: float | None = None,
+        steps: int | None = None,
+        state_only: bool = False,
+        replace: bool = False,
+        engine: Engine = "auto",
+    ):
+        """Continue the training run of an agent exactly where it stopped.
+
+        Args:
+            agent: name in data/checkpoints, or a folder.
+            hours: stop after this time; run again to continue.
+            steps: stop at this many environment steps in all.
+            state_only: leave the saved agent as it is; `anneal` makes one later.
+            replace: replace the saved agent even if it has more steps or a critic of its own.
+            engine: that of the run, or auto.
+        """
+        from shapebody.training.train import continue_run
+
+        _tell(
+            continue_run(
+                agent,
+                max_steps=steps,
+                max_seconds=_seconds(hours),
+                engine=engine,
+                state_only=state_only,
+                replace=replace,
+            )
+        )
+
+    _prepare()
+    return continue_run, words
 
 
-def _anneal(options):
-    from shapebody.training.train import anneal
+def _anneal(words):
+    """save an agent from an unfinished run, at a falling learning rate"""
+    import tyro
 
-    agent = anneal(
-        options.agent,
-        options.steps,
-        max_seconds=_seconds(options),
-        engine=options.engine,
-        replace=options.replace,
-    )
-    if agent is None:
-        print("not finished: the agent is as it was, the same command continues")
-    else:
-        print(f"agent {agent.name}: {agent.metadata['steps']:,} steps")
+    def anneal(
+        agent: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="AGENT")],
+        steps: int = 1_640_000,
+        hours: float | None = None,
+        replace: bool = False,
+        engine: Engine = "auto",
+    ):
+        """Save an agent from a copy of its run, after a last part at a falling learning rate.
+
+        Args:
+            agent: name in data/checkpoints, or a folder.
+            steps: of that part.
+            hours: stop after this time; run again to continue.
+            replace: replace the saved agent even if it has more steps or a critic of its own.
+            engine: that of the run, or auto.
+        """
+        from shapebody.training.train import anneal
+
+        made = anneal(agent, steps, max_seconds=_seconds(hours), engine=engine, replace=replace)
+        _tell(made, "not finished: the agent is as it was, the same command continues")
+
+    _prepare()
+    return anneal, words
 
 
-def _sharpen(options):
-    from shapebody.agent.store import agent_folder, load_agent
+def _policy_evaluation(words):
+    """train a new critic for an agent's frozen policy"""
+    import tyro
+
     from shapebody.networks.config import CriticConfig
-    from shapebody.training.policy_evaluation import train_critic
 
-    seconds, agent = _seconds(options), load_agent(options.agent)
-    full = agent.metadata.get("scale") == "full"
-    sharper = train_critic(
-        agent,
-        CriticConfig() if full else CriticConfig.sharp(),
-        options.steps,
-        folder=agent_folder(options.agent),
-        max_seconds=seconds,
-        engine=options.engine,
-        task_of=options.task_of,
-    )
-    if sharper is agent:
-        print("not finished: the agent is as it was, the same command continues")
-    else:
-        steps = sharper.metadata["policy_evaluation"]["steps"]
-        print(f"agent {sharper.name}: a critic of {steps:,} steps of policy evaluation")
+    sharp = CriticConfig.sharp()
+
+    def policy_evaluation(
+        agent: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="AGENT")],
+        critic: CriticConfig = sharp,
+        steps: int | None = None,
+        hours: float | None = None,
+        task_of: Literal["evaluation", "training"] = "evaluation",
+        engine: Engine = "auto",
+    ):
+        """Freeze an agent's policy and train a new critic on its rollouts.
+
+        Args:
+            agent: name in data/checkpoints, or a folder.
+            critic: its sizes; the paper's for agents of scale `full`, where none are given.
+            steps: environment steps; 12 % of those of training if not given.
+            hours: stop after this time; run again to continue.
+            task_of: which task the critic learns: that on which designs are evaluated, or that of
+                the policy's training.
+            engine: native is MuJoCo in C, mjx is JAX; auto: native on a CPU.
+        """
+        from shapebody.agent.store import agent_folder, load_agent
+        from shapebody.training.policy_evaluation import train_critic
+
+        seconds, known = _seconds(hours), load_agent(agent)
+        full = known.metadata.get("scale") == "full" and critic == sharp
+        made = train_critic(
+            known,
+            CriticConfig() if full else critic,
+            steps,
+            folder=agent_folder(agent),
+            max_seconds=seconds,
+            engine=engine,
+            task_of=task_of,
+        )
+        if made is known:
+            print("not finished: the agent is as it was, the same command continues")
+        else:
+            count = made.metadata["policy_evaluation"]["steps"]
+            print(f"agent {made.name}: a critic of {count:,} steps of policy evaluation")
+
+    _prepare()
+    return policy_evaluation, words
 
 
-def _design(options):
+def _design(words):
+    """search for a better body"""
+    import tyro
+
+    from shapebody.arguments import require_choice
+    from shapebody.optimizers.search import METHODS
+
+    name = require_choice("--method", _value_of("--method", words) or "vgds", METHODS)
+    kind = METHODS[name].config
+
+    def design(
+        robot: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="ROBOT")],
+        settings: Annotated[kind, tyro.conf.arg(name="")] = kind(),  # noqa: B008
+        agent: str | None = None,
+        method: str = name,
+        start: int | None = None,
+        seed: int = 0,
+        trust_region: float = 100.0,
+        freeze: tuple[str, ...] = ("size",),
+        out: str | None = None,
+    ):
+        """Search for a better body of a robot, as its agent's critic judges bodies.
+
+        Args:
+            robot: name in data/robots, or an MJCF or URDF file.
+            settings: of the search method.
+            agent: name in data/checkpoints, or a folder; the agent named as the robot if not given.
+            method: vgds, or another name of shapebody.METHODS.
+            start: number of a start design; the reference if not given.
+            seed: of the search.
+            trust_region: the weight λ of the soft trust region.
+            freeze: parameters that stay as they are: size is the scale of the whole body. Alone,
+                without a name, it frees all, as in the paper.
+            out: write the found body to this MJCF file.
+        """
+        return _search(robot, settings, agent, method, start, seed, trust_region, freeze, out)
+
+    _prepare()
+    return design, words
+
+
+def _search(robot, settings, agent, method, start, seed, trust_region, freeze, out):
     import numpy as np
 
     from shapebody.agent.store import load_agent
@@ -191,27 +275,148 @@ def _design(options):
     from shapebody.optimizers.search import search
     from shapebody.robot.robot import load_robot
 
-    robot = load_robot(options.robot)
-    _check_out(options.out, robot)
-    agent = load_agent(robot.name if options.agent is None else options.agent)
+    robot = load_robot(robot)
+    _check_out(out, robot)
+    agent = load_agent(robot.name if agent is None else agent)
     _warn_of_another_robot(agent, robot)
     space = DesignSpace(robot)
-    f = space.reference if options.start is None else space.start(options.start)
-    frozen, weight = tuple(options.freeze), options.trust_region
+    f = space.reference if start is None else space.start(start)
     found = search(
-        options.method, agent, robot, f, trust_region=weight, seed=options.seed, frozen=frozen
+        method,
+        agent,
+        robot,
+        f,
+        trust_region=trust_region,
+        seed=seed,
+        frozen=freeze,
+        **dataclasses.asdict(settings),
     )
     print(f"{found.method}: {found.evaluations} critic evaluations, {found.seconds:.1f} s")
-    print(f"frozen: {', '.join(frozen) or 'nothing'}")
-    objective = Objective.of(agent, robot, weight, frozen=frozen)
+    print(f"frozen: {', '.join(freeze) or 'nothing'}")
+    objective = Objective.of(agent, robot, trust_region, frozen=freeze)
     print(f"objective {float(objective(f[None])[0]):.2f} -> {found.objective:.2f}")
     for label, index in space.groups.items():
         change = float(np.sqrt(np.mean(found.design[index] ** 2)))
         print(f"  {label:32s} RMS change from the reference {change:.3f}")
     for change in large_changes(space, found.design):
         print(f"shapebody: warning: another robot: {change}", file=sys.stderr)
-    if options.out:
-        print(f"wrote {atomic_write(options.out, space.to_mjcf(found.design))}")
+    if out:
+        print(f"wrote {atomic_write(out, space.to_mjcf(found.design))}")
+
+
+def _evaluate(words):
+    """return and tracking error of an agent on a body"""
+    import tyro
+
+    from shapebody.evaluation.evaluate import EvaluationConfig
+
+    default = EvaluationConfig()
+
+    def evaluate(
+        agent: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="AGENT")],
+        settings: Annotated[EvaluationConfig, tyro.conf.arg(name="")] = default,
+        robot: str | None = None,
+        start: int | None = None,
+        seed: int = 0,
+        engine: Engine = "auto",
+    ):
+        """Let an agent's policy walk with a body, and print its return and tracking error.
+
+        Args:
+            agent: name in data/checkpoints, or a folder.
+            settings: of the evaluation.
+            robot: name in data/robots, or a file; the agent's first robot if not given.
+            start: number of a start design; the reference if not given.
+            seed: of the episodes.
+            engine: native is MuJoCo in C, mjx is JAX; auto: native on a CPU.
+        """
+        from shapebody.agent.store import load_agent
+        from shapebody.design.space import DesignSpace
+        from shapebody.evaluation.evaluate import evaluate
+        from shapebody.robot.robot import load_robot
+
+        known = load_agent(agent)
+        # Its configuration has the files of robots that are not among the shipped ones.
+        trained = known.metadata.get("config", {}).get("robots", known.robots)
+        body = load_robot(trained[0] if robot is None else robot)
+        _warn_of_another_robot(known, body)
+        space = DesignSpace(body)
+        f = space.reference if start is None else space.start(start)
+        print(evaluate(known, body, f, seed=seed, engine=engine, config=settings).summary())
+
+    _prepare()
+    return evaluate, words
+
+
+def _validate(words):
+    """what the method sees in a robot file"""
+    import tyro
+
+    def validate(
+        robot: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="ROBOT")],
+        out: str | None = None,
+    ) -> int:
+        """Say what the method sees in a robot file, what it infers, and what looks wrong.
+
+        Args:
+            robot: an MJCF or URDF file, or a name in data/robots.
+            out: write the completed file to this MJCF file.
+        """
+        from shapebody.arguments import require_output
+        from shapebody.robot.report import validate_robot
+
+        if out is not None:
+            require_output("--out", out)
+        report = validate_robot(robot)
+        print(report)
+        if out is not None:
+            print(f"\nwrote {report.write(out)}")
+        return 0 if report.ok else 1
+
+    return validate, words
+
+
+COMMANDS = {
+    "train": _train,
+    "continue": _continue,
+    "anneal": _anneal,
+    "policy-evaluation": _policy_evaluation,
+    "design": _design,
+    "evaluate": _evaluate,
+    "validate": _validate,
+}
+
+
+# ------------------------------------------------------------------ what they share
+
+
+def _prepare() -> None:
+    from shapebody.runtime import enable_compilation_cache
+
+    enable_compilation_cache()
+
+
+def _value_of(flag: str, words) -> str | None:
+    """The value of an option that decides which others there are, read before the rest."""
+    for word, following in zip(words, [*words[1:], None], strict=True):
+        if word == flag:
+            return following
+        if word.startswith(f"{flag}="):
+            return word.partition("=")[2]
+    return None
+
+
+def _seconds(hours: float | None) -> float | None:
+    from shapebody.arguments import require_number
+
+    return None if hours is None else 3600 * require_number("--hours", hours, 0)
+
+
+def _tell(agent, otherwise: str = "") -> None:
+    if agent is not None:
+        print(f"agent {agent.name}: {agent.metadata['steps']:,} steps")
+    elif otherwise:
+        print(otherwise)
 
 
 def _check_out(out, robot) -> None:
@@ -226,7 +431,7 @@ def _check_out(out, robot) -> None:
             f"--out is {out}, the file of the robot itself, whose reference body would be lost; "
             "give another name"
         )
-    path.absolute().parent.mkdir(parents=True, exist_ok=True)
+    Path(path).absolute().parent.mkdir(parents=True, exist_ok=True)
 
 
 def _warn_of_another_robot(agent, robot) -> None:
@@ -246,38 +451,6 @@ def _warn_of_another_robot(agent, robot) -> None:
             f"{agent.name} was trained; what it says of other bodies is a guess",
             file=sys.stderr,
         )
-
-
-def _validate(options) -> int:
-    from shapebody.arguments import require_output
-    from shapebody.robot.report import validate_robot
-
-    if options.out is not None:
-        require_output("--out", options.out)
-    report = validate_robot(options.robot)
-    print(report)
-    if options.out is not None:
-        print(f"\nwrote {report.write(options.out)}")
-    return 0 if report.ok else 1
-
-
-def _evaluate(options):
-    from shapebody.agent.store import load_agent
-    from shapebody.design.space import DesignSpace
-    from shapebody.evaluation.evaluate import evaluate
-    from shapebody.robot.robot import load_robot
-
-    agent = load_agent(options.agent)
-    # Its configuration has the files of robots that are not among the shipped ones.
-    trained = agent.metadata.get("config", {}).get("robots", agent.robots)
-    robot = load_robot(trained[0] if options.robot is None else options.robot)
-    _warn_of_another_robot(agent, robot)
-    space = DesignSpace(robot)
-    f = space.reference if options.start is None else space.start(options.start)
-    score = evaluate(
-        agent, robot, f, episodes=options.episodes, seed=options.seed, engine=options.engine
-    )
-    print(score.summary())
 
 
 if __name__ == "__main__":

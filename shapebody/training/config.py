@@ -60,25 +60,34 @@ class TrainConfig:
     robots: Robots
     """Robots to train on, names or paths; environments are shared out evenly."""
     scale: Literal["smoke", "reduced", "full"] = "full"
+    """Name of the sizes; `at_scale` chooses all that belongs to them."""
     seed: Seed = 0
+    """Seed of everything that is drawn."""
 
     policy: PolicyConfig = field(default_factory=PolicyConfig)
+    """Sizes of the policy."""
     critic: CriticConfig = field(default_factory=CriticConfig)
+    """Sizes of the critic."""
     standardize: Flag = False
     """Standardize the network's inputs over the design distribution."""
 
     num_envs: Size = 4096
+    """Environments that run side by side."""
     rollout_length: Size = 64
     """Control steps per environment and iteration."""
     total_steps: integer(1, MOST_STEPS) = 1_000_000_000
+    """Environment steps of the whole run."""
     minibatch_size: Size = 16_384
     """Control steps per gradient step: whole environments times the rollout length. If it does not
     divide the batch (15,040 environments), every epoch leaves out some environments at random."""
     epochs: Size = 10
+    """Passes over each rollout."""
     learning_rate: Pair = (1.5e-3, 3e-4)
     """At the first and at the last step; linear between."""
     discount: Probability = 0.99
+    """Discount factor γ per control step."""
     gae_lambda: Probability = 0.7
+    """The GAE parameter of advantages."""
     value_lambda: Probability | None = None
     """gae_lambda of the critic's targets, if not the same. With short rollouts and few gradient
     steps, a small one makes the critic learn slowly what lasts longer than 1 / (1 - lambda) steps.
@@ -87,12 +96,16 @@ class TrainConfig:
     """The policy's advantages end where the command changes, as if the episode were truncated. No
     action causes that change, so what the new command is worth is only noise to the policy."""
     clip_range: Positive = 0.1
+    """Half-width of the interval about 1 to which probability ratios are clipped."""
     entropy_coefficient: NonNegative = 0.005
+    """Weight of the policy's entropy in its loss."""
     max_gradient_norm: Positive = 3.0
+    """Gradients with a larger norm are scaled down to it."""
     kl_threshold: Threshold = 0.5
     """The rest of an iteration's updates is skipped once a minibatch exceeds this; inf: never."""
 
     task: TaskConfig = field(default_factory=TaskConfig)
+    """Settings of the locomotion task."""
     learn_policy: Flag = True
     """False in the policy-evaluation phase: only the critic learns, at c = 1."""
     mean_actions: Flag = False
