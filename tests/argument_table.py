@@ -788,7 +788,7 @@ FUNCTIONS = {
     "runtime.cache_folder": {},
     "runtime.enable_compilation_cache": {},
     "runtime.keep_memory": {},
-    "runtime.start_notebook": {},
+    "show.notebook.start_notebook": {},
     "optimizers.bayesian.BOConfig": dict(
         initial_points=integer(2, 10**6, 2),
         restarts=CONFIG_COUNT,
