@@ -5,12 +5,14 @@ import lazy_loader
 __getattr__, __dir__, __all__ = lazy_loader.attach(
     __name__,
     submodules=[
+        "diagrams",
         "notebook",
         "opengl",
         "plots",
         "render",
         "scene",
         "software_renderer",
+        "study_plots",
         "tables",
         "video",
     ],

@@ -11,7 +11,7 @@ from pandas.io.formats.style import Styler
 
 from shapebody.agent.agent import require_agent
 from shapebody.agent.store import load_curve
-from shapebody.arguments import refuse, require_integer, require_list, require_text
+from shapebody.arguments import refuse, require_integer, require_kind, require_list, require_text
 
 PAPER_TEXT = "#71767F"
 """Grey of a column that holds the paper's numbers."""
@@ -80,6 +80,22 @@ def interval(gain, digits: int = 2) -> str:
     values = [gain[x] for x in ("mean", "low", "high")] if isinstance(gain, dict) else gain[:3]
     mean, low, high = (f"{value:+.{digits}f}" for value in values)
     return f"{mean} [{low}, {high}]"
+
+
+class Folded:
+    """Tables behind a line that opens them; in a terminal they are simply printed."""
+
+    def __init__(self, title: str, *parts):
+        self.title, self.parts = require_text("title", title), parts
+        for part in parts:
+            require_kind("a part", part, Table, "from tables.table")
+
+    def __repr__(self) -> str:
+        return "\n\n".join(map(repr, self.parts))
+
+    def _repr_html_(self) -> str:
+        inside = "".join(part.to_html() for part in self.parts)
+        return f"<details><summary>{html.escape(self.title)}</summary>{inside}</details>"
 
 
 def agents_table(agents: Iterable):
