@@ -100,12 +100,12 @@ def critics():
         boxes |= {
             f"{name} d": (at + 0.06, 0.78, "$d_j$", DATA),
             f"{name} o": (at + 0.06, 0.22, "$o_j$", DATA),
-            f"{name} key": (at + 0.19, 0.78, "key network\n$\\alpha_j(d_j)$", NETWORK),
+            f"{name} key": (at + 0.19, 0.78, "key network\n$\\alpha_j(d_j, o_j)$", NETWORK),
             f"{name} value": (at + 0.19, 0.22, value, NETWORK),
             f"{name} sum": (at + 0.31, 0.5, "sum", STEP),
             f"{name} head": (at + 0.41, 0.5, f"{text}\n$\\bar V(s, d)$", NETWORK),
         }
-        parts = [("d", "key"), ("o", "value"), ("key", "sum"), ("value", "sum"), ("sum", "head")]
+        parts = [("d", "key"), ("o", "key"), ("o", "value"), ("key", "sum"), ("value", "sum"), ("sum", "head")]
         parts += [("d", "value")] if name == "direct" else []
         arrows += [(f"{name} {a}", f"{name} {b}") for a, b in parts]
     return flow(boxes, arrows)
