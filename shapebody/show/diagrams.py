@@ -109,3 +109,18 @@ def critics():
         parts += [("d", "value")] if name == "direct" else []
         arrows += [(f"{name} {a}", f"{name} {b}") for a, b in parts]
     return flow(boxes, arrows)
+
+
+def actor_and_learner(rollouts: int = 5):
+    """Who works when on a CPU: the actor collects with the policy from before the update."""
+    figure, ax = plt.subplots(figsize=(7, 1.9))
+    style = dict(ha="center", va="center", fontsize=8)
+    for n in range(rollouts):
+        ax.broken_barh([(n, 0.96)], (1, 0.8), color=COLOURS["sky"])
+        ax.text(n + 0.48, 1.4, f"collect {n} with π{max(n - 1, 0)}", **style)
+        if n:
+            ax.broken_barh([(n, 0.96)], (0, 0.8), color=COLOURS["orange"])
+            ax.text(n + 0.48, 0.4, f"learn {n - 1}: π{n - 1} → π{n}", **style)
+    ax.set(yticks=[0.4, 1.4], yticklabels=["learner", "actor"], xticks=[], xlabel="time")
+    ax.grid(False)
+    return figure
