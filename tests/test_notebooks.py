@@ -19,7 +19,8 @@ def test_shipped_notebook_is_executed_and_clean(path):
 
 
 def write(path, *sources):
-    cells = [nbformat.v4.new_code_cell(source) for source in sources]
+    cells = [nbformat.v4.new_markdown_cell("text")]
+    cells += [nbformat.v4.new_code_cell(source) for source in sources]
     nbformat.write(nbformat.v4.new_notebook(cells=cells), path)
     return path
 
@@ -34,7 +35,7 @@ def test_execute_saves_the_same_file_twice(tmp_path, capsys):
     notebooks.execute(path)
     assert path.read_text() == first
     assert notebooks.problems(path) == []
-    cells = nbformat.read(path, as_version=4).cells
+    cells = nbformat.read(path, as_version=4).cells[1:]
     assert [cell.outputs[0].text for cell in cells[:2]] == ["99 %\n", "a\nb\n"]
     assert cells[2].outputs[0].data["text/plain"] == "3"
 

@@ -38,14 +38,12 @@ def execute(path: Path, timeout: float | None = None) -> None:
     tagged "raises-exception" may raise. timeout: seconds for one cell.
     """
     notebook = nbformat.read(path, as_version=4)
-    cells, began = code_cells(notebook), []
-
-    def start(cell, **_):
-        began.append(time.perf_counter())
+    number, began = 0, time.perf_counter()
 
     def done(cell, **_):
-        seconds = time.perf_counter() - began[-1]
-        print(f"  cell {len(began)} of {len(cells)}: {seconds:.1f} s", flush=True)
+        nonlocal number, began
+        number, seconds, began = number + 1, time.perf_counter() - began, time.perf_counter()
+        print(f"  cell {number} of {len(code_cells(notebook))}: {seconds:.1f} s", flush=True)
 
     NotebookClient(
         notebook,
@@ -55,7 +53,6 @@ def execute(path: Path, timeout: float | None = None) -> None:
         coalesce_streams=True,  # also keeps only the last state of a progress bar
         store_widget_state=False,
         resources={"metadata": {"path": str(path.parent)}},
-        on_cell_start=start,
         on_cell_executed=done,
     ).execute()
     atomic_write(path, nbformat.writes(clean(notebook)) + "\n")
