@@ -51,7 +51,7 @@ test: venv
 	exit $$status
 
 notebooks: venv
-	SHAPEBODY_SCALE=$(SCALE) $(PY) -m shapebody.notebooks $(NOTEBOOKS)
+	SHAPEBODY_SCALE=$(SCALE) $(PY) -m tools.notebooks $(NOTEBOOKS)
 
 lint: venv
 	$(PY) -m ruff check .

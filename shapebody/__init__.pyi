@@ -21,9 +21,9 @@ from .reproduction.scale import scale as scale
 from .robot.report import validate_robot as validate_robot
 from .robot.robot import load_robot as load_robot
 from .robot.robot import robots as robots
-from .runtime import start_notebook as start_notebook
 from .show import plots as plots
 from .show import video as video
+from .show.notebook import start_notebook as start_notebook
 from .task.config import TaskConfig as TaskConfig
 from .training.config import TrainConfig as TrainConfig
 from .training.train import train as train

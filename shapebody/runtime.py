@@ -1,4 +1,4 @@
-"""What a process sets up once: the compilation cache, and the first cell of a notebook."""
+"""What a process sets up once: the compilation cache, and how the C library keeps memory."""
 
 import hashlib
 import os
@@ -55,37 +55,6 @@ def enable_compilation_cache() -> Path | None:
     jax.config.update("jax_compilation_cache_dir", str(folder))
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.5)
     return folder
-
-
-def start_notebook() -> None:
-    """Set up a notebook and print one line with the versions its results were made with.
-
-    Compilation cache, house style of figures, off-screen OpenGL (MUJOCO_GL is set where nothing
-    else is and there is no display), and no preallocation of GPU memory, so that two notebooks can
-    share one GPU. Every step respects settings made before.
-    """
-    os.environ.setdefault("XLA_PYTHON_CLIENT_PREALLOCATE", "false")
-    enable_compilation_cache()
-
-    from shapebody.show import opengl, plots
-
-    interface = opengl.find_opengl()
-    if sys.platform == "linux" and interface in ("egl", "osmesa"):
-        os.environ.setdefault("MUJOCO_GL", interface)
-    plots.use_style()
-
-    import jax
-    import mujoco
-
-    import shapebody
-
-    device = jax.devices()[0]
-    where = "the CPU" if device.platform == "cpu" else device.device_kind
-    print(
-        f"shapebody {shapebody.__version__}, Python {platform.python_version()}, "
-        f"jax {jax.__version__} on {where}, mujoco {mujoco.__version__}, "
-        f"pictures through {interface or 'drawing'}"
-    )
 
 
 def keep_memory() -> bool:

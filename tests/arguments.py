@@ -146,12 +146,6 @@ FOLDER = Kind(
     lambda world: world.folder / "new", frozenset({"dots", "a/b", "Path .."}), "any folder"
 )
 FUNCTION = Kind(lambda world: len, frozenset({"class"}), "a class can be called")
-ANSWER = Kind(
-    lambda world: 1.0,
-    frozenset(WRONG),
-    "every answer is judged, none is an error; only what a function of the reader's raises",
-    frozenset(WRONG) - {"class"},
-)
 COUNT, STEPS = integer(1), integer(1, 10**15)
 
 ROBOT = thing(lambda world: world.robot)
@@ -322,16 +316,6 @@ def _(world):
     return Renderer(world.robot.model, 32, 32, opengl=False)
 
 
-@makes("live", "show.scene.LiveScene")
-def _(world):
-    """Without the viewer, which starts a server."""
-    from shapebody.show.scene import LiveScene
-
-    live = object.__new__(LiveScene)
-    live.space, live._parts = world.space, None
-    return live
-
-
 @makes("scene", "show.scene.Scene")
 def _(world):
     from shapebody.show.scene import Scene
@@ -394,28 +378,10 @@ def _(world):
     return Report(world.robot.path, world.robot, (), (), ())
 
 
-@makes("search_result")
-def _(world):
-    from shapebody.optimizers.search import SearchResult
-
-    path = np.zeros((3, world.space.dim), np.float32)
-    settings = dict(max_update=0.1, learning_rate=0.05, trust_region=0.0)
-    return SearchResult(path[0], path, 0.0, np.zeros(3), 1, 1.0, 0.0, "vgds", settings)
-
-
 @makes("curve")
 def _(world):
     path = world.folder / "curve.csv"
     path.write_text("steps,coefficient\n1,0.5\n2,1\n")
-    return path
-
-
-@makes("notebook")
-def _(world):
-    import nbformat
-
-    path = world.folder / "a.ipynb"
-    nbformat.write(nbformat.v4.new_notebook(), path)
     return path
 
 

@@ -226,10 +226,9 @@ def test_wrong_arguments(path, world, capsys):
 
 def commands():
     """(words of a right call by name of its argument, the argument, its action) of every flag."""
-    from shapebody import __main__, notebooks
+    from shapebody import __main__
 
     def parsers():
-        yield "notebooks", notebooks.main, notebooks.parser()
         choices = __main__.parser()._subparsers._group_actions[0].choices
         yield from ((name, __main__.main, parser) for name, parser in choices.items())
 
@@ -287,8 +286,8 @@ def test_wrong_words_on_the_command_line(command, main, parser, action, world, m
     monkeypatch.setattr("shapebody.evaluation.evaluate._environment", worked)
     monkeypatch.setitem(search.METHODS, "vgds", search.METHODS["vgds"]._replace(function=worked))
     robot, agent = str(world.robot.path), str(world.agent_folder)
-    known = {"robots": robot, "robot": robot, "agent": agent, "notebook": str(world.notebook)}
-    words = [] if command == "notebooks" else [command]
+    known = {"robots": robot, "robot": robot, "agent": agent}
+    words = [command]
     for other in parser._actions:
         if not other.option_strings and other is not action and other.dest in known:
             words.append(known[other.dest])
@@ -310,11 +309,10 @@ def test_wrong_words_on_the_command_line(command, main, parser, action, world, m
         except SystemExit as stopped:  # argparse, which names the argument
             status = stopped.code
         told = capsys.readouterr()
-        said = told.err if command not in ("validate", "notebooks") else told.err + told.out
+        said = told.err if command != "validate" else told.err + told.out
         assert status in (1, 2), (word, said)
         assert "Traceback" not in said and said.strip(), word
-        # argparse shows the whole value, and so does the list of executed notebooks.
-        assert len(said) < 3000 or status == 2 or command == "notebooks", (word, len(said))
+        assert len(said) < 3000 or status == 2, (word, len(said))  # argparse shows it whole
 
 
 # ------------------------------------------------------------------ homeless, and a full disk
@@ -329,7 +327,6 @@ def nobody(*_):
 pwd.getpwuid = pwd.getpwnam = nobody
 import shapebody
 from shapebody import runtime
-from shapebody import notebooks
 assert runtime.enable_compilation_cache() is None
 assert len(shapebody.robots()) == 50
 for call in (shapebody.load_robot, shapebody.load_agent):
@@ -339,14 +336,10 @@ for call in (shapebody.load_robot, shapebody.load_agent):
         assert "home folder is unknown" in str(error), error
 from shapebody.__main__ import main
 assert main(["validate", "~/x.xml"]) == 1
-notebooks.problems("a.ipynb")
 print("fine")
 """
     environment = {k: v for k, v in os.environ.items() if k not in ("HOME", "XDG_CACHE_HOME")}
     environment.pop("JAX_COMPILATION_CACHE_DIR", None)
-    import nbformat
-
-    nbformat.write(nbformat.v4.new_notebook(), tmp_path / "a.ipynb")
     done = subprocess.run(
         [sys.executable, "-c", code],
         env=environment | {"PYTHONPATH": str(PACKAGE.parent), "MPLCONFIGDIR": str(tmp_path)},

@@ -62,6 +62,21 @@ def test_foot_is_where_mujoco_puts_it():
     assert matrix[:3, :3] == pytest.approx(0.04 * np.eye(3), abs=1e-4)
 
 
+def test_floor_is_an_opaque_plate_just_below_the_feet():
+    scene = show_scene.show_design(Space())
+    floor = next(c for c in commands(scene, "set_object") if c["path"] == "/floor")
+    (material,) = floor["object"]["materials"]
+    assert material["type"] == "MeshBasicMaterial"  # its colour does not depend on the lights
+    assert material["opacity"] == 1 and not material["transparent"]
+    background = [c["value"] for c in scene.commands if c.get("property") == "bottom_color"]
+    shades = [material["color"] >> 16 & 255, 255 * background[0][0]]
+    assert shades[0] < shades[1] - 20
+    place = next(c for c in commands(scene, "set_transform") if c["path"] == "/floor")
+    matrix = np.reshape(place["matrix"], (4, 4)).T
+    assert -0.01 < matrix[2, 3] + matrix[2, 2] < 0  # its top
+    assert matrix[0, 0] >= 5 and matrix[1, 1] >= 5
+
+
 def test_animation_moves_only_what_changes():
     scene = show_scene.animate_designs(Space(), np.linspace(0, 1, 11)[:, None], frames=5)
     (animation,) = commands(scene, "set_animation")

@@ -38,7 +38,7 @@ def test_smoothing_draws_nothing_where_nothing_is_known(tmp_path):
 
 def test_agents_table():
     agents = [load_agent(name) for name in ("unitree_go2", "golem")]
-    first, second = tables.agents_table(agents).rows
+    first, second = tables.agents_table(agents).data.values.tolist()
     assert first[0] == "unitree_go2" and first[1].endswith(" million")
     assert 0 < float(second[2]) <= 1
     assert "million, " in second[3] and second[3].endswith(" actions")
@@ -53,19 +53,55 @@ def test_missing_column_is_named(curve):
 
 
 def test_paper_table():
-    table = tables.paper_table(
-        [("return", 42.6, (41.97, 0.312)), ("steps", None, 13_000_000)], note="ours (reduced)"
-    )
-    assert table.markdown().splitlines()[2:] == [
-        "| return | 42.60 | 41.97 ± 0.31 |",
-        "| steps | – | 13,000,000 |",
+    rows = [("return", 42.6, (41.97, 0.312)), ("steps", None, 13_000_000)]
+    table = tables.paper_table(rows, note="ours (reduced)", caption="a < b")
+    assert table.data.values.tolist() == [
+        ["return", "42.60", "41.97 ± 0.31"],
+        ["steps", "–", "13,000,000"],
     ]
-    assert "ours (reduced)" in table._repr_html_()
-    assert str(table).splitlines()[1].endswith("41.97 ± 0.31")
+    assert repr(table).splitlines() == [
+        "a < b",
+        "        paper  ours (reduced)",
+        "return  42.60    41.97 ± 0.31",
+        "steps       –      13,000,000",
+    ]
+    page = table.to_html()
+    assert "ours (reduced)" in page and "<caption>a &lt; b</caption>" in page
+    assert f"td.col1 {{\n  color: {tables.PAPER_TEXT}" in page
+    again = tables.paper_table(rows, note="ours (reduced)", caption="a < b")
+    assert again.to_html() == page  # no identifier by chance
+    assert tables.table([], ("a", "b")).to_html()
+
+
+@pytest.mark.parametrize(
+    "title, grey",
+    [
+        ("paper", True),
+        ("paper ΔR", True),
+        ("critic: paper", True),
+        ("paper | ours", False),
+        ("the paper's starts", False),
+    ],
+)
+def test_columns_of_the_paper_are_grey(title, grey):
+    page = tables.table([("a", 1)], ("", title)).to_html()
+    assert (tables.PAPER_TEXT in page) is grey
 
 
 def test_table_escapes_html():
-    assert "&lt;b&gt;" in tables.table([("<b>", 1)], ("a", "b"))._repr_html_()
+    page = tables.table([("<b>", 1)], ("<i>", "b")).to_html()
+    assert "&lt;b&gt;" in page and "&lt;i&gt;" in page
+
+
+def test_titles_of_columns_differ():
+    with pytest.raises(ValueError, match="titles that differ"):
+        tables.table([(1, 2)], ("ours", "ours"))
+
+
+def test_interval():
+    gain = (1.234, -0.5, 2.0, "differences")
+    assert tables.interval(gain) == "+1.23 [-0.50, +2.00]"
+    assert tables.interval(dict(mean=1.0, low=0.0, high=2.0), 1) == "+1.0 [+0.0, +2.0]"
 
 
 def test_ragged_rows_are_refused():

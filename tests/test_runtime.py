@@ -44,6 +44,6 @@ def test_unwritable_cache_is_left_off(monkeypatch, tmp_path):
 
 
 def test_start_notebook_prints_one_line_of_versions():
-    out, err = run("from shapebody.runtime import start_notebook; start_notebook()")
+    out, err = run("from shapebody import start_notebook; start_notebook()")
     assert out.count("\n") == 1 and "mujoco 3.17.0" in out and "jax 0." in out
     assert err == ""

@@ -68,13 +68,13 @@ def test_pictures_leave_the_model_alone(model, backend):
 
 
 def test_body_grid(model, backend):
-    grid = render.body_grid([model] * 3, labels=list("abc"), columns=2, height=60, width=80)
+    grid = video.body_grid([model] * 3, labels=list("abc"), columns=2, height=60, width=80)
     assert grid.shape == (2 * (60 + 26), 160, 3)
 
 
 def test_drawing_says_once_how_to_get_opengl(model, monkeypatch, capsys):
-    monkeypatch.setattr(video, "find_opengl", lambda: None)
-    opengl._say.cache_clear()
+    monkeypatch.setattr(render, "find_opengl", lambda: None)
+    opengl.say_once.cache_clear()
     render.render_frame(model, height=40, width=40)
     render.render_frame(model, height=40, width=40)
     said = capsys.readouterr().out
@@ -82,7 +82,7 @@ def test_drawing_says_once_how_to_get_opengl(model, monkeypatch, capsys):
 
 
 def test_opengl_that_fails_late_is_replaced_by_drawing(model, monkeypatch, capsys):
-    monkeypatch.setattr(video, "find_opengl", lambda: "no_such_interface")
+    monkeypatch.setattr(render, "find_opengl", lambda: "no_such_interface")
     assert render.render_frame(model, height=40, width=40).shape == (40, 40, 3)
     assert "no_such_interface" in capsys.readouterr().out
 
@@ -91,7 +91,7 @@ def test_opengl_is_found_after_mujoco_was_imported():
     if opengl.find_opengl() is None:
         pytest.skip("no OpenGL on this machine")
     program = (
-        "import mujoco; from shapebody import video; "
+        "import mujoco; from shapebody.show import render; "
         "model = mujoco.MjModel.from_xml_string('<mujoco><worldbody><body><freejoint/>"
         '<geom size=".1"/></body></worldbody></mujoco>\'); '
         "print(render.render_frame(model, height=32, width=32).shape)"
@@ -133,8 +133,8 @@ def test_video_without_ffmpeg_is_a_gif(monkeypatch, tmp_path, capsys):
         raise RuntimeError("no ffmpeg")
 
     monkeypatch.setattr(imageio_ffmpeg, "get_ffmpeg_exe", missing)
-    monkeypatch.setattr(opengl.shutil, "which", lambda name: None)
-    opengl._say.cache_clear()
+    monkeypatch.setattr(video.shutil, "which", lambda name: None)
+    opengl.say_once.cache_clear()
     kind, data = video.encode_video(clip())
     assert kind == "image/gif" and data[:3] == b"GIF"
     page = video.video_html(clip())
@@ -167,7 +167,7 @@ def test_film_strip():
         (lambda m: video.side_by_side(clip(), clip(height=20)), "one height"),
         (lambda m: video.side_by_side(clip(), labels=["a", "b"]), "2 labels for 1"),
         (lambda m: video.encode_video(np.zeros((3, 4, 4, 3))), "expected uint8"),
-        (lambda m: render.body_grid([]), "at least one"),
+        (lambda m: video.body_grid([]), "at least one"),
     ],
 )
 def test_wrong_input_is_named(model, call, message):

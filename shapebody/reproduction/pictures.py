@@ -6,7 +6,7 @@ import json
 from shapebody.arguments import require_output
 from shapebody.files import atomic_write
 from shapebody.reproduction.results import result_provenance
-from shapebody.show import render
+from shapebody.show import video
 
 
 def before_after(agent, robot, path, start: int = 3, trust_region: float = 100.0) -> None:
@@ -26,7 +26,7 @@ def before_after(agent, robot, path, start: int = 3, trust_region: float = 100.0
     found = search("vgds", agent, robot, f, trust_region=trust_region).design
     models = [space.to_model(x) for x in (f, found, space.reference)]
     labels = [f"start design {start}", "found by VGDS", "reference"]
-    picture = render.body_grid(models, labels=labels, columns=3)
+    picture = video.body_grid(models, labels=labels, columns=3)
     source = PngInfo()
     source.add_text(
         "provenance", json.dumps(result_provenance(agent, start=start, trust_region=trust_region))

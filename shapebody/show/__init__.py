@@ -4,5 +4,16 @@ import lazy_loader
 
 __getattr__, __dir__, __all__ = lazy_loader.attach(
     __name__,
-    submodules=["opengl", "plots", "render", "scene", "software_renderer", "tables", "video"],
+    submodules=[
+        "diagrams",
+        "notebook",
+        "opengl",
+        "plots",
+        "render",
+        "scene",
+        "software_renderer",
+        "study_plots",
+        "tables",
+        "video",
+    ],
 )

@@ -14,7 +14,7 @@ context.free()
 print("works")
 """
 
-_NO_OPENGL = (
+NO_OPENGL = (
     "No OpenGL found, so robots are drawn instead of rendered. To install it: "
     "'apt-get install libegl1 libgl1-mesa-dri' (Debian, Ubuntu), "
     "'dnf install mesa-libEGL mesa-dri-drivers' (Fedora) or "
@@ -62,5 +62,6 @@ def _candidates() -> list[str]:
 
 
 @functools.cache
-def _say(message: str) -> None:
+def say_once(message: str) -> None:
+    """Print a message, but only the first time."""
     print(message)

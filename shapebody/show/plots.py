@@ -1,4 +1,4 @@
-"""House style of the figures, learning curves, and the table "paper | ours"."""
+"""House style of the figures, learning curves, and rows of intervals."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -119,3 +119,34 @@ def intervals(labels: Sequence[str], values: Sequence, colours: Sequence = (), a
             ax.plot(mean, place, "o", color=colour)
     ax.set(yticks=range(len(labels)), yticklabels=labels, ylim=(-0.7, len(labels) - 0.3))
     return ax
+
+
+def panels(titles: Sequence[str], columns: int = 1, size=(3.3, 3.0), **options) -> list:
+    """Axes of a figure with a panel per title side by side, or with a row of `columns` per title.
+
+    Returns a list of axes, or of rows of axes. size: of one panel, in inches; options go to
+    `plt.subplots`. The title is above the first panel of a row.
+    """
+    titles = [require_text("a title", title) for title in require_list("titles", titles)]
+    if not titles:
+        raise ValueError("titles is empty; expected the title of at least one panel")
+    require_integer("columns", columns, 1, 20)
+    width, height = require_array("size", size, (2,))
+    shape = (1, len(titles)) if columns == 1 else (len(titles), columns)
+    figsize = (max(shape[1] * width, 4), shape[0] * height)
+    _, axes = plt.subplots(*shape, figsize=figsize, squeeze=False, **options)
+    axes = list(axes[0]) if columns == 1 else list(axes)
+    for ax, title in zip(axes if columns == 1 else [row[0] for row in axes], titles, strict=True):
+        ax.set_title(title)
+    return axes
+
+
+def legend_beside(axes: Sequence) -> None:
+    """One legend for all panels, beside the last, since an entry may be in some of them only."""
+    entries = {}
+    axes = require_list("axes", axes)
+    if not axes:
+        raise ValueError("axes is empty; expected at least one panel")
+    for ax in map(_axes, axes):
+        entries |= dict(zip(*reversed(ax.get_legend_handles_labels()), strict=True))
+    axes[-1].legend(entries.values(), entries.keys(), loc="center left", bbox_to_anchor=(1.0, 0.5))

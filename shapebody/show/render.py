@@ -15,7 +15,7 @@ from shapebody.arguments import (
 )
 from shapebody.robot.geometry import SHOWN_GROUPS, standing_pose
 from shapebody.show import software_renderer
-from shapebody.show.opengl import _NO_OPENGL, _say, find_opengl
+from shapebody.show.opengl import NO_OPENGL, find_opengl, say_once
 
 
 class Renderer:
@@ -37,7 +37,7 @@ class Renderer:
         smooth: bool = False,
         opengl: bool = True,
     ):
-        model = _model_of(model)
+        model = model_of(model)
         require_size(height, width)
         for name, value in (("spheres", spheres), ("smooth", smooth), ("opengl", opengl)):
             require_flag(name, value)
@@ -60,10 +60,10 @@ class Renderer:
             try:
                 self._open(interface, groups, rows, columns)
             except Exception as error:  # the kinds differ by interface, and a drawing is enough
-                _say(f"OpenGL ({interface}) failed with {error!r}, so robots are drawn instead.")
+                say_once(f"OpenGL ({interface}) failed with {error!r}: robots are drawn instead.")
                 self._context = self._pixels = None
         elif opengl:
-            _say(_NO_OPENGL)
+            say_once(NO_OPENGL)
 
     def _open(self, name, groups, rows, columns):
         self._context = importlib.import_module(f"mujoco.{name}").GLContext(columns, rows)
@@ -107,7 +107,7 @@ class Renderer:
 
     def place(self, qpos) -> None:
         """Forward kinematics at `qpos`[nq]."""
-        qpos = _check_qpos(self.model, qpos, 1)
+        qpos = require_qpos(self.model, qpos, 1)
         self.data.qpos[:] = qpos
         mujoco.mj_kinematics(self.model, self.data)
         mujoco.mj_comPos(self.model, self.data)
@@ -116,7 +116,7 @@ class Renderer:
     def distance(self, lookat, azimuth: float = 130.0, elevation: float = -18.0) -> float:
         """Smallest camera distance in m from `lookat` that shows every visible geom."""
         lookat = require_array("lookat", lookat, (3,))
-        _require_camera(1.0, azimuth, elevation)
+        require_camera(1.0, azimuth, elevation)
         if len(self.geoms) == 0:
             return 2 * float(self.model.stat.extent)
         right, up, forward = software_renderer.view_axes(azimuth, elevation)
@@ -143,7 +143,7 @@ class Renderer:
         distance: of the camera from it in m; if None, so that the robot fills the picture. Angles
         in degrees.
         """
-        _require_camera(distance, azimuth, elevation)
+        require_camera(distance, azimuth, elevation)
         self.place(qpos)
         lookat = self.centre() if lookat is None else require_array("lookat", lookat, (3,))
         if distance is None:
@@ -183,7 +183,8 @@ class Renderer:
         return fine[:, 0, :, 0].copy() if self._detail == 1 else fine.mean((1, 3)).astype(np.uint8)
 
 
-def _model_of(body, name: str = "body") -> mujoco.MjModel:
+def model_of(body, name: str = "body") -> mujoco.MjModel:
+    """The model of a Robot, or the model itself; TypeError for anything else."""
     model = getattr(body, "model", body)
     if not isinstance(model, mujoco.MjModel):
         expected = "a mujoco.MjModel or a Robot; for a design, space.to_model(f)"
@@ -201,14 +202,16 @@ def require_size(height, width) -> None:
     require_integer("width", width, 16, MOST_PIXELS)
 
 
-def _require_camera(distance, azimuth, elevation) -> None:
+def require_camera(distance, azimuth, elevation) -> None:
+    """ValueError unless distance (m, or None) is positive, and the angles (degrees) are numbers."""
     if distance is not None:
         require_number("distance", distance, above=0)
     require_number("azimuth", azimuth)
     require_number("elevation", elevation)
 
 
-def _check_qpos(model, qpos, ndim):
+def require_qpos(model, qpos, ndim: int) -> np.ndarray:
+    """One pose float64[nq], or with `ndim` 2 a trajectory [T, nq]; ValueError for anything else."""
     qpos = require_array("qpos", qpos, finite=False).astype(float)
     expected = f"[{'T, ' if ndim == 2 else ''}{model.nq}]"
     if qpos.ndim != ndim or qpos.shape[-1] != model.nq:
@@ -225,13 +228,13 @@ def render_frame(body, qpos=None, *, height=360, width=480, spheres=False, **cam
     keywords go to `Renderer.picture` (lookat, distance in m, azimuth, elevation in degrees).
     Raises ValueError for a qpos of the wrong length, TypeError for something without a model.
     """
-    model = _model_of(body)
+    model = model_of(body)
     unknown = camera.keys() - {"lookat", "distance", "azimuth", "elevation"}
     if unknown:
         raise TypeError(
             f"render_frame has no argument {min(unknown)!r}; expected lookat, distance, azimuth or "
             "elevation"
         )
-    qpos = standing_pose(model) if qpos is None else _check_qpos(model, qpos, 1)
+    qpos = standing_pose(model) if qpos is None else require_qpos(model, qpos, 1)
     with Renderer(model, height, width, spheres, smooth=True) as renderer:
         return renderer.picture(qpos, **camera)

@@ -2,7 +2,6 @@
 
 A `Scene` is one HTML page of about 0.9 MB with everything inside (in a notebook it takes a third of
 that). It needs no server, so it also works in a notebook that is opened later or somewhere else.
-`LiveScene` talks to a running viewer.
 """
 
 import base64
@@ -17,7 +16,6 @@ import mujoco
 import numpy as np
 
 from shapebody.arguments import (
-    refuse,
     require_array,
     require_flag,
     require_integer,
@@ -126,9 +124,9 @@ def show_design(robot_or_space, f=None, qpos=None, spheres: bool = False, height
     model = _model(robot_or_space, f)
     require_integer("height", height, 16, 8192)
     parts = _parts(model, require_flag("spheres", spheres))
-    pose = standing_pose(model) if qpos is None else render._check_qpos(model, qpos, 1)
+    pose = standing_pose(model) if qpos is None else render.require_qpos(model, qpos, 1)
     commands = [_add(part) for part in parts]
-    commands += [_place(part, transform) for part, transform in _transforms(parts, model, pose)]
+    commands += [_place(part.path, place) for part, place in _transforms(parts, model, pose)]
     return Scene([*_surroundings(model, pose), *commands], height)
 
 
@@ -157,7 +155,7 @@ def animate_designs(space, trajectory, seconds: float = 4.0, frames: int = 60, h
         for model, pose in zip(models, poses, strict=True)
     ]
     commands = [_add(part) for part in parts]
-    commands += [_place(part, transform) for part, transform in zip(parts, every[0], strict=True)]
+    commands += [_place(part.path, place) for part, place in zip(parts, every[0], strict=True)]
     clips = [
         {
             "path": part.path,
@@ -178,45 +176,6 @@ def animate_designs(space, trajectory, seconds: float = 4.0, frames: int = 60, h
         }
     )
     return Scene([*_surroundings(models[0], poses[0]), *commands], height)
-
-
-class LiveScene:
-    """A MeshCat viewer in its own browser tab that shows one design after another.
-
-    >>> live = LiveScene(space)          # prints the address to open
-    >>> live.show(space.start(seed=3))
-    """
-
-    def __init__(self, space):
-        _require_space(space)
-        import meshcat
-
-        self.space = space
-        self.viewer = meshcat.Visualizer()
-        self.viewer["/Grid"].set_property("visible", True)
-        self._parts = None
-
-    @property
-    def url(self) -> str:
-        return self.viewer.url()
-
-    def show(self, f=None) -> None:
-        """Replace the design shown by `f`[d], the reference if None."""
-        from meshcat import geometry
-
-        shapes = {
-            "BoxGeometry": lambda: geometry.Box([2.0, 2.0, 2.0]),
-            "SphereGeometry": lambda: geometry.Sphere(1.0),
-            "CylinderGeometry": lambda: geometry.Cylinder(2.0, 1.0),
-        }
-        model = _model(self.space, f)
-        if self._parts is None:
-            self._parts = _parts(model, spheres=False)
-            for part in self._parts:
-                material = geometry.MeshLambertMaterial(color=part.colour, opacity=part.opacity)
-                self.viewer[part.path].set_object(shapes[part.shape](), material)
-        for part, transform in _transforms(self._parts, model, standing_pose(model)):
-            self.viewer[part.path].set_transform(_matrix(*transform))
 
 
 _ROD = "_between"
@@ -257,11 +216,7 @@ def _model(robot_or_space, f):
         return robot_or_space.to_model(robot_or_space.reference if f is None else f)
     if f is not None:
         raise ValueError("a design f needs a DesignSpace: show_design(DesignSpace(robot), f)")
-    model = getattr(robot_or_space, "model", robot_or_space)
-    if not isinstance(model, mujoco.MjModel):
-        expected = "a Robot, a DesignSpace or a mujoco.MjModel"
-        raise refuse("robot_or_space", robot_or_space, expected, kind=TypeError)
-    return model
+    return render.model_of(robot_or_space, "robot_or_space")
 
 
 def _parts(model, spheres):
@@ -334,34 +289,40 @@ def _rounded(values):
 
 
 def _add(part):
-    material = {
-        "uuid": f"material{part.path}",
-        "type": "MeshLambertMaterial",
-        "color": part.colour,
-        "opacity": part.opacity,
-        "transparent": part.opacity < 1,
+    return _mesh(part.path, part.shape, "MeshLambertMaterial", part.colour, part.opacity)
+
+
+def _mesh(path, shape, material, colour, opacity=1.0):
+    """The command that puts a unit shape at a path of the scene."""
+    surface = {
+        "uuid": f"material{path}",
+        "type": material,
+        "color": colour,
+        "opacity": opacity,
+        "transparent": opacity < 1,
     }
-    shape = {"uuid": f"shape{part.path}", "type": part.shape, **_UNIT_SHAPES[part.shape]}
+    geometry = {"uuid": f"shape{path}", "type": shape, **_UNIT_SHAPES[shape]}
+    mesh = {
+        "uuid": f"mesh{path}",
+        "type": "Mesh",
+        "geometry": geometry["uuid"],
+        "material": surface["uuid"],
+    }
     return {
         "type": "set_object",
-        "path": part.path,
+        "path": path,
         "object": {
             "metadata": {"version": 4.5, "type": "Object"},
-            "geometries": [shape],
-            "materials": [material],
-            "object": {
-                "uuid": f"mesh{part.path}",
-                "type": "Mesh",
-                "geometry": shape["uuid"],
-                "material": material["uuid"],
-            },
+            "geometries": [geometry],
+            "materials": [surface],
+            "object": mesh,
         },
     }
 
 
-def _place(part, transform):
+def _place(path, transform):
     columns = _matrix(*transform).T.flatten()
-    return {"type": "set_transform", "path": part.path, "matrix": _rounded(columns)}
+    return {"type": "set_transform", "path": path, "matrix": _rounded(columns)}
 
 
 def _tracks(transforms):
@@ -393,7 +354,7 @@ def _quaternions(rotations):
 
 
 def _surroundings(model, qpos):
-    """Camera and background. Positions are in the viewer's frame, whose y axis points up."""
+    """Camera, background and floor. The camera's frame is the viewer's, whose y axis points up."""
     with render.Renderer(model, opengl=False) as view:
         view.place(qpos)
         centre = view.centre()
@@ -412,4 +373,16 @@ def _surroundings(model, qpos):
                 ("/Background", "bottom_color", [0.97, 0.98, 0.99]),
             )
         ],
+        *_floor(),
     ]
+
+
+def _floor():
+    """A plate below the viewer's grid of half-metre squares, which alone is hardly seen.
+
+    Its colour does not depend on the lights, and its top is 4 mm below the grid, so that the two
+    are told apart from afar.
+    """
+    colour = _number(software_renderer.FLOOR_COLOUR)
+    below = np.array([0, 0, -0.009]), np.eye(3), np.array([10, 10, 0.005])
+    return [_mesh("/floor", "BoxGeometry", "MeshBasicMaterial", colour), _place("/floor", below)]

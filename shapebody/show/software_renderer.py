@@ -1,6 +1,6 @@
 """Pictures of primitive geoms without OpenGL: shaded polygons, painted from far to near.
 
-Slower and plainer than MuJoCo's renderer, but it needs nothing except NumPy and Pillow. `video`
+Slower and plainer than MuJoCo's renderer, but it needs nothing except NumPy and Pillow. `render`
 falls back on it.
 """
 
@@ -10,8 +10,9 @@ import mujoco
 import numpy as np
 from PIL import Image, ImageDraw
 
+FLOOR_COLOUR = (0.84, 0.86, 0.88)
+BONE_COLOUR = (0.42, 0.45, 0.50, 1.0)
 _BACKGROUND = (0.93, 0.95, 0.97)
-_FLOOR = (0.84, 0.86, 0.88)
 _LINES = (0.72, 0.75, 0.78)
 _LIGHT = np.array([0.35, -0.5, 0.8]) / np.linalg.norm([0.35, -0.5, 0.8])
 _OVERSAMPLING = 2
@@ -104,9 +105,6 @@ def bone_radius(model: mujoco.MjModel) -> float:
     return 0.011 * float(model.stat.extent)
 
 
-BONE_COLOUR = (0.42, 0.45, 0.50, 1.0)
-
-
 def rotation_to(direction: np.ndarray) -> np.ndarray:
     """float64[3, 3], a rotation whose third column is along `direction`[3]."""
     quaternion, matrix = np.zeros(4), np.zeros(9)
@@ -157,6 +155,21 @@ def draw(
     canvas = ImageDraw.Draw(picture)
     _draw_floor(canvas, project, np.asarray(lookat), forward, distance)
 
+    quads, normals, colours = _world_quads(model, data, geoms)
+    if len(quads):
+        brightness = 0.55 + 0.45 * np.clip(normals @ _LIGHT, -0.4, 1)
+        shades = np.clip(colours * brightness[:, None] * 255, 0, 255).astype(int)
+        pixels, depth = project(quads)
+        facing = np.einsum("nk,nk->n", normals, quads.mean(1) - eye) < 0
+        visible = np.flatnonzero(facing & (depth.min(1) > _NEAR))
+        # From far to near, so that what is near covers what is behind it.
+        for i in visible[np.argsort(-depth[visible].mean(1), kind="stable")]:
+            canvas.polygon([tuple(p) for p in pixels[i]], fill=tuple(shades[i].tolist()))
+    return np.asarray(picture.resize((width, height), Image.Resampling.BOX))
+
+
+def _world_quads(model, data, geoms):
+    """All quads of geoms and bones: corners [n, 4, 3], outward normals [n, 3], colours [n, 3]."""
     shapes = [
         (
             surface(model.geom_type[geom], model.geom_size[geom]),
@@ -173,26 +186,15 @@ def draw(
         size = np.array([bone_radius(model), np.linalg.norm(end - start) / 2, 0])
         rod = surface(_GEOM.mjGEOM_CAPSULE, size)
         shapes.append((rod, rotation_to(end - start), (start + end) / 2, np.array(BONE_COLOUR)))
-    quads, normals, colours = [], [], []
+    quads, colours = [np.empty((0, 4, 3))], [np.empty((0, 3))]
     for local, rotation, position, rgba in shapes:
-        if local is None:
-            continue
-        world = local @ rotation.T + position
-        normal = np.cross(world[:, 2] - world[:, 0], world[:, 3] - world[:, 1])
-        normal /= np.linalg.norm(normal, axis=-1, keepdims=True) + 1e-12
-        quads.append(world)
-        normals.append(normal)
-        colours.append(np.broadcast_to(rgba[:3], (len(world), 3)))
-    if quads:
-        quads, normals = np.concatenate(quads), np.concatenate(normals)
-        brightness = 0.55 + 0.45 * np.clip(normals @ _LIGHT, -0.4, 1)
-        shades = np.clip(np.concatenate(colours) * brightness[:, None] * 255, 0, 255).astype(int)
-        pixels, depth = project(quads)
-        facing = np.einsum("nk,nk->n", normals, quads.mean(1) - eye) < 0
-        visible = np.flatnonzero(facing & (depth.min(1) > _NEAR))
-        for i in visible[np.argsort(-depth[visible].mean(1), kind="stable")]:
-            canvas.polygon([tuple(p) for p in pixels[i]], fill=tuple(shades[i].tolist()))
-    return np.asarray(picture.resize((width, height), Image.Resampling.BOX))
+        if local is not None:
+            quads.append(local @ rotation.T + position)
+            colours.append(np.broadcast_to(rgba[:3], (len(local), 3)))
+    quads = np.concatenate(quads)
+    normals = np.cross(quads[:, 2] - quads[:, 0], quads[:, 3] - quads[:, 1])
+    normals /= np.linalg.norm(normals, axis=-1, keepdims=True) + 1e-12
+    return quads, normals, np.concatenate(colours)
 
 
 def _draw_floor(canvas, project, lookat, forward, distance):
@@ -208,7 +210,7 @@ def _draw_floor(canvas, project, lookat, forward, distance):
     pixels, depth = project(np.column_stack([border, np.zeros(len(border))]))
     front = depth > _NEAR
     if forward[2] < 0 and front.sum() > 2:
-        canvas.polygon([tuple(p) for p in pixels[front]], fill=_rgb(_FLOOR))
+        canvas.polygon([tuple(p) for p in pixels[front]], fill=_rgb(FLOOR_COLOUR))
     for axis in (0, 1):
         for step in steps:
             ends = np.zeros((2, 3))

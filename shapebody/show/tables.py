@@ -1,80 +1,65 @@
-"""Tables of notebooks, "paper | ours" among them."""
+"""Tables of notebooks, "paper | ours" among them: pandas' styled data frames."""
 
+import hashlib
 import html
+import re
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
 
 import numpy as np
+import pandas as pd
+from pandas.io.formats.style import Styler
 
+from shapebody.agent.agent import require_agent
+from shapebody.agent.store import load_curve
 from shapebody.arguments import refuse, require_integer, require_kind, require_list, require_text
 
+PAPER_TEXT = "#71767F"
+"""Grey of a column that holds the paper's numbers."""
 
-@dataclass(frozen=True)
-class Table:
-    """A table that a notebook shows as HTML, and a terminal as text."""
 
-    header: tuple[str, ...]
-    rows: tuple[tuple[str, ...], ...]
-    caption: str = ""
+class Table(Styler):
+    """A styled data frame of texts (`data`) that prints as a table, too."""
 
-    def __post_init__(self):
-        rows = require_list("rows", self.rows)
-        for name, row in (("header", self.header), *(("a row", row) for row in rows)):
-            require_kind(name, row, tuple, "of texts, see plots.table")
-            for cell in row:
-                require_text(f"a cell of {name}", cell, 10_000)
-            if len(row) != len(self.header):
-                raise ValueError(f"{name} has {len(row)} cells; expected {len(self.header)}")
-        require_text("caption", self.caption, 10_000)
-
-    def markdown(self) -> str:
-        rule = ["---"] + ["---:"] * (len(self.header) - 1)
-        lines = ["| " + " | ".join(row) + " |" for row in (self.header, rule, *self.rows)]
-        return "\n".join(([self.caption, ""] if self.caption else []) + lines)
-
-    def __str__(self) -> str:
-        columns = list(zip(self.header, *self.rows, strict=True))
-        widths = [max(len(cell) for cell in column) for column in columns]
-        lines = [
-            "  ".join(
-                [row[0].ljust(widths[0])]
-                + [cell.rjust(width) for cell, width in zip(row[1:], widths[1:], strict=True)]
-            )
-            for row in (self.header, *self.rows)
+    def __repr__(self) -> str:
+        cells = [list(self.data.columns), *self.data.values.tolist()]
+        widths = [max(map(len, column)) for column in zip(*cells, strict=True)]
+        rows = [
+            "  ".join([row[0].ljust(widths[0]), *map(str.rjust, row[1:], widths[1:])])
+            for row in cells
         ]
-        return "\n".join(([self.caption] if self.caption else []) + lines)
-
-    __repr__ = __str__
-
-    def _repr_html_(self) -> str:
-        def cells(row, tag):
-            aligned = ["left"] + ["right"] * (len(row) - 1)
-            return "".join(
-                f'<{tag} style="text-align: {side}">{html.escape(cell)}</{tag}>'
-                for side, cell in zip(aligned, row, strict=True)
-            )
-
-        body = "".join(f"<tr>{cells(row, 'td')}</tr>" for row in self.rows)
-        caption = f"<caption>{html.escape(self.caption)}</caption>" if self.caption else ""
-        return (
-            f"<table>{caption}<thead><tr>{cells(self.header, 'th')}</tr></thead>"
-            f"<tbody>{body}</tbody></table>"
-        )
+        return "\n".join(([html.unescape(self.caption)] if self.caption else []) + rows)
 
 
 def table(rows: Iterable[Sequence], header: Sequence[str], digits: int = 2, caption: str = ""):
-    """Table of values. A number gets `digits` decimals, a pair (m, h) becomes "m ± h", None "–"."""
-    header = tuple(str(cell) for cell in require_list("header", header, 1000))
+    """Table of values with the first column to the left and all others to the right.
+
+    A number gets `digits` decimals, a pair (m, h) becomes "m ± h", None "–". A column is grey if
+    its title begins or ends with the word "paper". Raises ValueError for rows of another length
+    than the header, and for two columns of one title.
+    """
+    header = [str(cell) for cell in require_list("header", header, 1000)]
     if not header:
         raise ValueError("header is empty; expected the title of at least one column")
+    if len(set(header)) < len(header):
+        raise ValueError(f"header is {header}; expected titles that differ")
     require_integer("digits", digits, 0, 17)
     require_text("caption", caption, 10_000)
     rows = [require_list("a row", row) for row in require_list("rows", rows, 100_000)]
-    rows = tuple(tuple(_text(cell, digits) for cell in row) for row in rows)
     for row in rows:
         if len(row) != len(header):
             raise ValueError(f"row {row} has {len(row)} cells for the {len(header)} of {header}")
-    return Table(header, rows, caption)
+    texts = [[_text(cell, digits) for cell in row] for row in rows]
+    frame = pd.DataFrame(texts, columns=header, dtype=object)
+    styles = [("th, td", "text-align: right"), (".col0", "text-align: left")]
+    for number, title in enumerate(header):
+        words = re.findall(r"\w+", title.lower())
+        if "paper" in (*words[:1], *words[-1:]) and "ours" not in words:
+            styles.append((f"td.col{number}", f"color: {PAPER_TEXT}"))
+    # The identifier would be drawn at random, and every execution would be another file.
+    name = hashlib.sha256(repr((header, texts)).encode()).hexdigest()[:8]
+    styled = Table(frame, uuid=name, cell_ids=False, caption=html.escape(caption) or None)
+    styled.format(escape="html").format_index(escape="html", axis="columns").hide(axis="index")
+    return styled.set_table_styles([{"selector": x, "props": y} for x, y in styles])
 
 
 def paper_table(rows: Iterable[Sequence], digits: int = 2, caption: str = "", note: str = "ours"):
@@ -86,11 +71,35 @@ def paper_table(rows: Iterable[Sequence], digits: int = 2, caption: str = "", no
     return table(rows, ("", "paper", note), digits, caption)
 
 
+def interval(gain, digits: int = 2) -> str:
+    """Text "+1.20 [+0.50, +1.90]" of a mean with its interval.
+
+    gain: (mean, low, high, ...), as from `paired_gain`, or a dictionary of "mean", "low", "high".
+    """
+    require_integer("digits", digits, 0, 17)
+    values = [gain[x] for x in ("mean", "low", "high")] if isinstance(gain, dict) else gain[:3]
+    mean, low, high = (f"{value:+.{digits}f}" for value in values)
+    return f"{mean} [{low}, {high}]"
+
+
+class Folded:
+    """Tables behind a line that opens them; in a terminal they are simply printed."""
+
+    def __init__(self, title: str, *parts):
+        self.title, self.parts = require_text("title", title), parts
+        for part in parts:
+            require_kind("a part", part, Table, "from tables.table")
+
+    def __repr__(self) -> str:
+        return "\n\n".join(map(repr, self.parts))
+
+    def _repr_html_(self) -> str:
+        inside = "".join(part.to_html() for part in self.parts)
+        return f"<details><summary>{html.escape(self.title)}</summary>{inside}</details>"
+
+
 def agents_table(agents: Iterable):
     """Table of agents that are compared: their training, and that of the critic they bring."""
-    from shapebody.agent.agent import require_agent
-    from shapebody.agent.store import load_curve
-
     rows = []
     for agent in [require_agent(agent) for agent in require_list("agents", agents, 10_000)]:
         rows.append(

@@ -1,8 +1,8 @@
 """Pictures and videos of robots.
 
 MuJoCo renders them off screen through EGL, OSMesa or the system's own OpenGL, whichever works;
-without any of them they are drawn (`drawing`), and one printed line says how to install OpenGL.
-Pictures are uint8[height, width, 3], clips uint8[frames, height, width, 3].
+without any of them they are drawn (`software_renderer`), and one printed line says how to install
+OpenGL. Pictures are uint8[height, width, 3], clips uint8[frames, height, width, 3].
 """
 
 import base64
@@ -26,12 +26,12 @@ from shapebody.arguments import (
 )
 from shapebody.files import atomic_write
 from shapebody.robot.geometry import standing_pose
-from shapebody.show.opengl import _say
+from shapebody.show.opengl import say_once
 from shapebody.show.render import (
     Renderer,
-    _check_qpos,
-    _model_of,
-    _require_camera,
+    model_of,
+    require_camera,
+    require_qpos,
     require_size,
 )
 
@@ -58,14 +58,14 @@ def render_rollout(
     step_seconds: time between rows of `qpos` (control step, 0.02 s). The camera follows the trunk
     horizontally; give `distance` in m to compare robots at one scale.
     """
-    model = _model_of(body)
-    qpos = _check_qpos(model, qpos, 2)
+    model = model_of(body)
+    qpos = require_qpos(model, qpos, 2)
     if len(qpos) == 0:
         raise ValueError("qpos holds no rows, so there is nothing to show")
     require_number("fps", fps, 0.01, 1000)
     require_number("step_seconds", step_seconds, 1e-6, 1000)
     require_size(height, width)
-    _require_camera(distance, azimuth, elevation)
+    require_camera(distance, azimuth, elevation)
     frames = max(1, round(len(qpos) * step_seconds * fps))
     if frames > 100_000:
         raise ValueError(f"fps is {fps}, which makes {frames:,} pictures; expected at most 100,000")
@@ -164,7 +164,7 @@ def encode_video(frames: np.ndarray, fps: float = 25.0) -> tuple[str, bytes]:
     require_number("fps", fps, 0.01, 1000)
     program = ffmpeg()
     if program is None:
-        _say(_NO_FFMPEG)
+        say_once(_NO_FFMPEG)
         return "image/gif", _encode_gif(frames, fps)
     import mediapy
 
@@ -206,7 +206,7 @@ def _check_frames(frames):
 
 
 def _pictures(name, frames) -> np.ndarray:
-    """A picture or a clip; ValueError if it is none."""
+    """The array; ValueError unless it is a picture or a clip."""
     frames = require_array(name, frames, finite=False)
     right = frames.ndim in (3, 4) and frames.shape[-1] == 3 and frames.dtype == np.uint8
     if not right or 0 in frames.shape:
@@ -237,6 +237,10 @@ def show_video(frames: np.ndarray, fps: float = 25.0, width: int | None = None) 
     display(HTML(video_html(frames, fps, width)))
 
 
+SHOWN = ((), (3,), (4,))
+"""Last axis of a picture that can be shown: grey, colours, colours with opacity."""
+
+
 def show_image(picture: np.ndarray, width: int | None = None, colours: int | None = None) -> None:
     """Show a picture in the notebook, as a PNG that also appears where scripts are not run.
 
@@ -247,16 +251,7 @@ def show_image(picture: np.ndarray, width: int | None = None, colours: int | Non
     from IPython.display import display
 
     picture = require_array("picture", picture, finite=False)
-    if (
-        picture.dtype != np.uint8
-        or picture.ndim not in (2, 3)
-        or picture.shape[2:]
-        not in (
-            (),
-            (3,),
-            (4,),
-        )
-    ):
+    if picture.dtype != np.uint8 or picture.ndim not in (2, 3) or picture.shape[2:] not in SHOWN:
         raise refuse("picture", picture, "uint8[height, width, 3]")
     _require_width(width)
     image = Image.fromarray(picture)
@@ -292,7 +287,7 @@ def body_grid(
     qpos: one [nq] per body, the standing poses if None.
     """
     bodies = require_list("bodies", bodies, 10_000)
-    models = [_model_of(body, "an entry of bodies") for body in bodies]
+    models = [model_of(body, "an entry of bodies") for body in bodies]
     if not models:
         raise ValueError("bodies is empty; expected at least one body")
     if labels is not None:
@@ -300,11 +295,11 @@ def body_grid(
     if columns is not None:
         require_integer("columns", columns, 1)
     require_size(height, width)
-    _require_camera(None, azimuth, elevation)
+    require_camera(None, azimuth, elevation)
     poses = [standing_pose(m) for m in models] if qpos is None else require_list("qpos", qpos)
     if len(poses) != len(models):
         raise ValueError(f"{len(poses)} qpos for {len(models)} bodies; give one per body")
-    poses = [_check_qpos(model, pose, 1) for model, pose in zip(models, poses, strict=True)]
+    poses = [require_qpos(model, pose, 1) for model, pose in zip(models, poses, strict=True)]
     columns = min(columns or 5, len(models))
     with contextlib.ExitStack() as stack:
         renderers = [
