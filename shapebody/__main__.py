@@ -398,7 +398,7 @@ def _prepare() -> None:
 
 def _value_of(flag: str, words) -> str | None:
     """The value of an option that decides which others there are, read before the rest."""
-    for word, following in zip(words, [*words[1:], None], strict=True):
+    for word, following in zip(words, [*words[1:], None], strict=False):
         if word == flag:
             return following
         if word.startswith(f"{flag}="):

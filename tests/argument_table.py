@@ -80,6 +80,8 @@ INTERNAL = {
     "robot.urdf": "imports files that `find` has found, for `robot.importing`",
     "robot.urdf_checks": "looks at the text of files, for `robot.urdf`",
     "rotations": "formulas inside compiled code",
+    "show.diagrams": "drawings of the notebooks, without data",
+    "show.study_plots": "figures of records that `reproduction` computed, for the notebooks",
     "show.software_renderer": "draws models that `show.render` has looked at",
     "stored": "reads files whose paths others have looked at",
     "task.batch": "environments of `task.env`, which has looked at the arguments",
@@ -165,6 +167,9 @@ UNCHECKED = {
     "robot.report.Report": RESULT,
 }
 UNCHECKED |= {
+    "show.plots.legend_beside": "takes axes that the caller has drawn in",
+    "show.plots.panels": "called by the figures of studies",
+    "show.tables.Folded": "made by the tables of notebooks",
     "optimizers.loop.initial_population": METHOD,
     "show.opengl.say_once": "prints one of this package's messages",
     "show.render.model_of": "a check itself",

@@ -1,5 +1,6 @@
 """The command line: what reaches the functions behind it, and what is said of errors."""
 
+import dataclasses
 import sys
 from dataclasses import replace
 from pathlib import Path
@@ -8,8 +9,11 @@ import pytest
 from tiny import tiny_agent, tiny_robot
 
 from shapebody.__main__ import main
+from shapebody.agent.agent import Agent
 from shapebody.agent.store import load_agent, save_agent
+from shapebody.networks.config import CriticConfig
 from shapebody.robot.robot import load_robot
+from shapebody.training.config import TrainConfig
 
 
 @pytest.fixture(scope="module")
@@ -32,30 +36,47 @@ def test_options_of_training(files, monkeypatch):
     robot, agent = files
     monkeypatch.setenv("XLA_FLAGS", "")  # which `main` sets
     calls = []
-    monkeypatch.setattr(
-        "shapebody.training.train.train", lambda config, **given: calls.append(given)
-    )
-    monkeypatch.setattr(
-        "shapebody.training.train.anneal", lambda name, steps, **given: calls.append(given)
-    )
 
-    def train_critic(agent, *unnamed, **given):
-        calls.append(given)
-        return agent
+    def called(*unnamed, **given):
+        calls.append((unnamed, given))
+        return unnamed[0] if isinstance(unnamed[0], Agent) else None
 
-    monkeypatch.setattr("shapebody.training.policy_evaluation.train_critic", train_critic)
+    for name in ("train.train", "train.continue_run", "train.anneal"):
+        monkeypatch.setattr(f"shapebody.training.{name}", called)
+    monkeypatch.setattr("shapebody.training.policy_evaluation.train_critic", called)
     options = ["--engine", "mjx", "--hours", "2"]
-    assert main(["train", robot, "--replace", "--steps", "9", *options]) == 0
-    assert main(["anneal", "any", "--replace", *options]) == 0
-    assert main(["anneal", "any"]) == 0
-    assert main(["sharpen", agent, *options]) == 0
-    given = dict(max_seconds=7200, engine="mjx", replace=True)
-    assert calls[0] == given | dict(max_steps=9, state_only=False)
-    assert calls[1] == given
-    assert calls[2] == dict(max_seconds=None, engine="auto", replace=False)
-    assert calls[3] == dict(
-        max_seconds=7200, engine="mjx", folder=Path(agent), task_of="evaluation"
+    settings = ["--epochs", "5", "--policy.key-widths", "8", "32", "--task.action-delay", "1"]
+    assert main(["train", robot, "--replace", "--steps", "9", *options, *settings]) == 0
+    assert main(["continue", "any", "--state-only", *options]) == 0
+    assert main(["anneal", "any", "--replace"]) == 0
+    assert main(["policy-evaluation", agent, "--critic.heads", "2", *options]) == 0
+    ((config,), given), continued, annealed, critic = calls
+    assert (config.name, config.robots, config.scale) == ("legs_2", (robot,), "reduced")
+    assert (config.epochs, config.policy.key_widths, config.task.action_delay) == (5, (8, 32), 1)
+    common = dict(max_seconds=7200, engine="mjx")
+    assert given == common | dict(max_steps=9, replace=True, state_only=False)
+    assert continued == (
+        ("any",),
+        common | dict(max_steps=None, replace=False, state_only=True),
     )
+    assert annealed == (
+        ("any", 1_640_000),
+        dict(max_seconds=None, engine="auto", replace=True),
+    )
+    assert critic[0][1] == CriticConfig.sharp(heads=2)
+    assert critic[1] == common | dict(folder=Path(agent), task_of="evaluation")
+
+
+def test_help_explains_every_setting(capsys):
+    with pytest.raises(SystemExit) as stopped:
+        main(["train", "--help"])
+    assert stopped.value.code == 0
+    text = " ".join(capsys.readouterr().out.replace("│", " ").split())
+    for field in dataclasses.fields(TrainConfig):
+        assert f"--{field.name.replace('_', '-')}" in text
+    assert "Discount factor γ per control step" in text and "--task.horizon INT" in text
+    assert main([]) == 2 and "validate" in capsys.readouterr().err
+    assert main(["--help"]) == 0 and "validate" in capsys.readouterr().out
 
 
 def test_design_looks_at_its_output_before_it_searches(files, monkeypatch, tmp_path, capsys):
@@ -64,7 +85,7 @@ def test_design_looks_at_its_output_before_it_searches(files, monkeypatch, tmp_p
     def never(*arguments, **options):
         raise AssertionError("searched")
 
-    monkeypatch.setattr(sys.modules["shapebody.optimizers"], "search", never)
+    monkeypatch.setattr("shapebody.optimizers.search.search", never)
     assert main(["design", robot, "--agent", agent, "--out", robot]) == 1
     assert "the file of the robot itself" in capsys.readouterr().err
     assert main(["design", robot, "--agent", agent, "--out", str(tmp_path)]) == 1
