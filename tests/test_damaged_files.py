@@ -11,6 +11,7 @@ import io
 import json
 import os
 import re
+import signal
 import threading
 import tracemalloc
 import zipfile
@@ -336,6 +337,25 @@ def test_temporary_files_of_killed_writers_go_and_others_stay(tmp_path):
         assert sorted(tmp_path.iterdir()) == [alive, other, path]
     files.atomic_write(path, "newest")
     assert sorted(tmp_path.iterdir()) == [other, path] and path.read_text() == "newest"
+
+
+@pytest.mark.filterwarnings("ignore:.*fork.*")
+def test_a_lock_ends_with_its_process(tmp_path):
+    reader, writer = os.pipe()
+    child = os.fork()
+    if child == 0:
+        with files.alone_in(tmp_path):
+            os.write(writer, b"x")
+            signal.pause()
+    os.read(reader, 1)
+    with pytest.raises(ValueError, match="another training run is at work in"):
+        with files.alone_in(tmp_path):
+            pass
+    os.kill(child, signal.SIGKILL)
+    os.waitpid(child, 0)
+    with files.alone_in(tmp_path):
+        pass
+    assert not list(tmp_path.iterdir())
 
 
 def full_disk(*_):

@@ -60,6 +60,42 @@ def test_command_changes():
     assert losses.command_changes(observation, last)[1].tolist() == [False, False, False, True]
 
 
+def test_losses_against_plain_loops():
+    """The clipped surrogate, its weights and the value loss; steps that do not count may be NaN."""
+    rng = np.random.default_rng(1)
+    n, t, clip = 3, 4, 0.1
+    new, old, behaviour, advantage = rng.normal(size=(4, n, t)).astype(np.float32)
+    values = rng.normal(size=(n, t, 2)).astype(np.float32)
+    target = rng.normal(size=(n, t)).astype(np.float32)
+    valid = (rng.random((n, t)) < 0.7).astype(np.float32)
+    count = valid.sum()
+    surrogate = value = divergence = 0.0
+    for i, k in np.argwhere(valid > 0):
+        ratio = np.exp(new[i, k] - old[i, k])
+        importance = min(np.exp(old[i, k] - behaviour[i, k]), 2.0)
+        clipped = min(max(ratio, 1 - clip), 1 + clip)
+        surrogate -= importance * min(ratio * advantage[i, k], clipped * advantage[i, k]) / count
+        divergence += (ratio - 1 - np.log(ratio)) / count
+        value += 0.5 * np.mean((values[i, k] - target[i, k]) ** 2) / count
+    weight = losses.step_weights(valid)
+    importance = losses.importance_weight(old, behaviour)
+    new = np.where(valid > 0, new, np.float32("nan"))
+    ratio, log_ratio = losses.policy_ratio(new, old, valid)
+    got = losses.surrogate_loss(ratio, advantage, importance, weight, clip)
+    assert got == pytest.approx(surrogate, rel=1e-5)
+    assert losses.approximate_kl(ratio, log_ratio, weight) == pytest.approx(divergence, rel=1e-4)
+    assert losses.value_loss(values, target, weight) == pytest.approx(value, rel=1e-5)
+    outside = np.abs(np.asarray(ratio) - 1) > clip
+    share = losses.clipped_share(ratio, weight, clip)
+    assert share == pytest.approx(outside[valid > 0].mean(), rel=1e-5)
+    mean, variance = losses.moments(losses.normalized(advantage, valid), valid)
+    assert mean == pytest.approx(0, abs=1e-5) and variance == pytest.approx(1, rel=1e-4)
+    std, mask = np.full((n, t, 2), 0.5, np.float32), np.array([1, 0], np.float32)
+    expected = np.log(0.5) + 0.5 * np.log(2 * np.pi * np.e)
+    assert losses.entropy_bonus(std, mask, weight) == pytest.approx(expected, rel=1e-5)
+    assert losses.step_weights(np.zeros((n, t))).sum() == 0
+
+
 def test_configurations():
     full = training_config.TrainConfig.full("unitree_go2")
     assert (full.num_envs, full.rollout_length, full.minibatch_size) == (4096, 64, 16384)
@@ -585,6 +621,23 @@ def test_curve_has_a_row_per_interval(config, tmp_path, monkeypatch):
     assert [int(row.split(",")[0]) for row in rows[1:]] == [256, 512, 640]
 
 
+def test_speed_does_not_count_compilation(tmp_path):
+    rollout = SimpleNamespace(
+        terminated=np.zeros((2, 2), bool),
+        truncated=np.zeros((2, 2), bool),
+        finite=np.ones((2, 2), bool),
+    )
+    for name in ("episode_return", "episode_length", "episode_error", "coefficient", "reward"):
+        setattr(rollout, name, np.zeros((2, 2)))
+    curve = progress.Curve(tmp_path / "training.csv", 0)
+    curve.add(rollout, {}, 100, None)
+    assert "steps_per_second" not in curve.latest
+    curve.add(rollout, {}, 100, 0.5)
+    assert curve.latest["steps_per_second"] == 200
+    curve.write(200, 60.5)
+    assert progress.read_rows(curve.path)[0][0]["steps_per_second"] == "200"
+
+
 def test_a_row_that_was_cut_off_leaves_the_curve(tmp_path):
     path = tmp_path / "training.csv"
     cells = ["128", "1.5", "", *["0.25"] * (len(progress.CURVE) - 3)]  # no episode has ended
@@ -662,7 +715,7 @@ def test_mean_actions_are_without_noise(config, tmp_path):
 def test_progress_counts_from_the_second_iteration(capsys, monkeypatch, terminal):
     monkeypatch.setattr("sys.stdout.isatty", lambda: terminal, raising=False)
     now = [1000.0]
-    for name in ("time.monotonic", "time.time"):
+    for name in ("time.monotonic", "tqdm.std.time"):
         monkeypatch.setattr(name, lambda: now[0])
 
     def shown(last, seconds):

@@ -18,7 +18,7 @@ from shapebody.task.config import TaskConfig
 from shapebody.training.config import MOST_STEPS, TrainConfig
 from shapebody.training.progress import announce
 from shapebody.training.replacing import metadata_in
-from shapebody.training.run_state import require_budget, require_same_robots
+from shapebody.training.run_state import require_budget, require_own_config, require_same_robots
 from shapebody.training.train import run_or_interrupt
 from shapebody.training.trainer import Trainer
 
@@ -78,13 +78,15 @@ def train_critic(
     require_budget(None, max_seconds, progress)
     folder = _folder_for(agent) if folder is None else require_path("folder", folder)
     config = evaluation_config(agent, critic, steps, task_of, **changes)
-    announce(engine, len(config.robots), progress)
     # The state belongs to this policy: another one starts anew.
-    trainer = Trainer(config, folder / f"critic_{agent.policy_hash[:8]}", engine, agent.policy)
+    own, longer = folder / f"critic_{agent.policy_hash[:8]}", ("total_steps",)
+    require_own_config(own, config, longer)
+    announce(engine, len(config.robots), progress)
+    trainer = Trainer(config, own, engine, agent.policy)
     phases = agent.metadata.get("phases") or [{}]
     require_same_robots(phases[0].get("robots", {}), trainer.env.robots, f"agent {agent.name!r}")
     with trainer.alone():
-        trainer.start(changeable=("total_steps",))
+        trainer.start(changeable=longer)
         run_or_interrupt(trainer, progress, max_seconds=max_seconds)
         if trainer.steps < config.iterations * config.batch:
             return agent

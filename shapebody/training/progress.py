@@ -185,6 +185,7 @@ class Progress:
 
     def __init__(self, last: int, until: float, active: bool):
         self.last, self.until, self.active = last, until, active
+        self.first = None  # steps after the first iteration, and when that was
         self.bar = None
 
     def __enter__(self) -> "Progress":
@@ -200,7 +201,9 @@ class Progress:
         if not self.active:
             return
         if self.bar is None:
-            self.bar = _Bar(self.last, steps)
+            self.first = steps, time.monotonic()
+            self.bar = _Bar(self.last, steps, self._text(steps, curve.latest))
+            return
         self.bar.set_description_str(self._text(steps, curve.latest), refresh=False)
         self.bar.update(steps - self.bar.n)
 
@@ -212,12 +215,11 @@ class Progress:
                 f"xy error {row['tracking_error']:.3f} m/s"
             )
         text += f"  c {row['coefficient']:.2f}"
-        times = self.bar.format_dict
-        done = steps - times["initial"]
-        if done and times["elapsed"]:
-            rate = done / times["elapsed"]
-            left = min((self.last - steps) / rate, self.until - time.monotonic())
-            text += f"  {rate:,.0f} steps/s  {tqdm.format_interval(max(left, 0.0))} left"
+        done, now = steps - self.first[0], time.monotonic()
+        if done:
+            rate = done / max(now - self.first[1], 1e-9)
+            left = max(min((self.last - steps) / rate, self.until - now), 0.0)
+            text += f"  {rate:,.0f} steps/s  {tqdm.format_interval(left)} left"
         return text
 
 
@@ -226,9 +228,10 @@ class _Bar(tqdm):
 
     monitor_interval = 0  # no thread of its own, which would print more often
 
-    def __init__(self, total: int, initial: int):
+    def __init__(self, total: int, initial: int, text: str):
         interactive = sys.stdout.isatty() or "ipykernel" in sys.modules
         super().__init__(
+            desc=text,
             total=total,
             initial=initial,
             file=sys.stdout if interactive else _Lines(),

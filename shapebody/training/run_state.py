@@ -35,7 +35,7 @@ from shapebody.arguments import (
 )
 from shapebody.configuration import configuration, from_json, to_json
 from shapebody.stored import read_json, read_number
-from shapebody.training.config import MOST_STEPS, TrainConfig, located, robot_name
+from shapebody.training.config import MOST_STEPS, TrainConfig, robot_name
 
 STATE, PHASES, CURVE = "training.safetensors", "training.json", "training.csv"
 STATE_FILES = (STATE, PHASES, CURVE)
@@ -174,29 +174,29 @@ def run_engine(folder: Path, engine: str) -> str:
 # ---------------------------------------------------------------------- continuing
 
 
-def continued_phases(
-    folder: Path, config: TrainConfig, steps: int, robots, changeable: Collection[str] = ()
-) -> list[dict]:
-    """The phases of the run in a folder, which goes on with `config` after `steps` steps.
+def require_own_config(
+    folder: Path, config: TrainConfig, changeable: Collection[str] = ()
+) -> list[str]:
+    """Refuse a configuration that is not that of the run in a folder, if there is one.
 
     Args:
         folder: of the run.
-        config: its robots are `located`.
-        steps: environment steps that the run has taken.
-        robots: the robots of `config`. Files that have only moved are the same robots.
-        changeable: names of settings that may differ from those of the run; if one does, a phase
-            is added.
+        config: the configuration. Robots whose files have only moved are the same ones.
+        changeable: names of settings that may differ from those of the run.
+
+    Returns:
+        Names of the settings that do.
 
     Raises:
-        FileNotFoundError: if training.json is missing.
-        ValueError: if another setting, or a robot's file, differs from those of the run, or
-            training.json is damaged.
+        FileNotFoundError: if the run's training.json is missing.
+        ValueError: if another setting differs, or training.json is damaged.
     """
-    phases, last = read_phases(folder), read_config(folder)
-    if [robot_name(robot) for robot in last.robots] == [robot.name for robot in robots]:
-        last = replace(last, robots=config.robots)  # their hashes are compared below
-    else:
-        last = replace(last, robots=tuple(located(robot) for robot in last.robots))
+    if not has_run(folder):
+        return []
+    last = read_config(folder)
+    own, robots = ([robot_name(robot) for robot in x.robots] for x in (last, config))
+    if own == robots:
+        last = replace(last, robots=config.robots)  # `require_same_robots` compares their files
     before, now = to_json(last), to_json(config)
     different = [name for name in now if before[name] != now[name]]
     other = [name for name in different if name not in changeable or name == "robots"]
@@ -207,8 +207,21 @@ def continued_phases(
             f"own (train.continue_run, python -m shapebody continue {folder.name}), choose another "
             f"name for this one, or delete {STATE} there to begin anew"
         )
+    return different
+
+
+def continued_phases(
+    folder: Path, config: TrainConfig, steps: int, robots, changeable: Collection[str] = ()
+) -> list[dict]:
+    """The phases of the run in a folder, which goes on with `config` after `steps` steps.
+
+    A phase is added if one of the `changeable` settings differs. Raises what `require_own_config`
+    raises, and ValueError if the file of one of the `robots` is not that of the run.
+    """
+    different = require_own_config(folder, config, changeable)
+    phases = read_phases(folder)
     require_same_robots(phases[0].get("robots", {}), robots, f"the run in {folder.name}")
-    return phases + [{"from_step": steps, "config": now}] if different else phases
+    return phases + [{"from_step": steps, "config": to_json(config)}] if different else phases
 
 
 def require_same_robots(known: dict, robots, what: str) -> None:

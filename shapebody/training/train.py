@@ -9,7 +9,7 @@ from collections.abc import Mapping
 from pathlib import Path
 
 from shapebody.agent.agent import Agent
-from shapebody.agent.store import load_agent
+from shapebody.agent.store import chosen_folder, load_agent
 from shapebody.arguments import (
     require_engine,
     require_flag,
@@ -33,6 +33,7 @@ from shapebody.training.run_state import (
     read_config,
     read_phases,
     require_budget,
+    require_own_config,
     require_run,
     run_engine,
     run_folder,
@@ -155,6 +156,8 @@ def _train(
             f"max_steps is {max_steps}; one iteration is {config.batch} steps: give at least as "
             "many, or a configuration with fewer environments"
         )
+    # At once: the trainer, which looks again, takes a while to compile.
+    require_own_config(chosen_folder(folder, config.name), config, tuple(changeable))
     announce(engine, len(config.robots), progress)
     trainer = Trainer(config, folder, engine)
     # From reading the state to saving the agent: what another call has written meanwhile would be
