@@ -140,7 +140,7 @@ UNCHECKED = {
     "networks.policy.entropy": FORMULA,
     "networks.policy.log_prob": FORMULA,
     "networks.inputs.require_inputs": "a check itself, called by `Agent.act` and `Agent.values`",
-    "physics.protocol.Readings": RESULT,
+    "physics.protocol.EngineOutput": RESULT,
     "physics.engine.simulator": "called by `Locomotion`, which has looked at the engine's name",
     "physics.protocol.home_sensordata": "called by the engines with the model of `prepare`",
     "physics.mjx.PhysicsState": RESULT,

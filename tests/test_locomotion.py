@@ -359,6 +359,18 @@ def test_designs_are_checked(env):
         np.testing.assert_array_equal(old, new)
 
 
+def test_steps_are_for_the_native_engine(go2, env):
+    state = env.reset(jax.random.PRNGKey(0), designs=np.zeros(358))
+    other = Locomotion(go2, 6, "mjx")
+    for call in (
+        lambda: other.step(wave, None, state, jax.random.PRNGKey(0)),
+        lambda: other.restart(state, [0], jax.random.split(jax.random.PRNGKey(0), 1)),
+        other.physics_arrays,
+    ):
+        with pytest.raises(ValueError, match="is for the native engine, and .* runs on 'mjx'"):
+            call()
+
+
 def test_without_auto_reset_an_environment_goes_on(go2):
     """As the documentation of `auto_reset` says: whoever steps it has to note the end."""
     config = TaskConfig(**QUIET, horizon=1)
@@ -373,7 +385,7 @@ def test_without_auto_reset_an_environment_goes_on(go2):
 NUMBERS = [
     field.name
     for field in fields(TaskConfig)
-    if isinstance(getattr(TaskConfig(), field.name), int | float) and field.type is not bool
+    if type(getattr(TaskConfig(), field.name)) in (int, float)
 ] + ["command_limit", "action_delay", "velocity_bound"]
 
 

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import copy
-import dataclasses
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Iterator
 
 import mujoco
 import numpy as np
 
+from shapebody.design.phi import MODEL_FIELDS, Embodiment
 from shapebody.robot.geometry import standing_pose
 from shapebody.robot.robot import Robot
 from shapebody.robot.spec_edits import comment
@@ -28,16 +28,12 @@ _SIZES = {
 _ORIENTATIONS = ("quat", "euler", "axisangle", "xyaxes", "zaxis", "fromto")
 
 
-def model_fields(embodiment) -> dict[str, np.ndarray]:
+def model_fields(embodiment: Embodiment) -> dict[str, np.ndarray]:
     """The fields of an embodiment that are fields of MjModel, as float64 arrays."""
-    return {
-        field.name: np.asarray(getattr(embodiment, field.name), np.float64)
-        for field in dataclasses.fields(embodiment)
-        if hasattr(mujoco.MjModel, field.name)
-    }
+    return {name: np.asarray(getattr(embodiment, name), np.float64) for name in MODEL_FIELDS}
 
 
-def build_model(robot: Robot, embodiment, scale) -> mujoco.MjModel:
+def build_model(robot: Robot, embodiment: Embodiment, scale) -> mujoco.MjModel:
     """A copy of the robot's model with all fields of one embodiment.
 
     `scale` [3] are the size factors (s_x, s_y, s_z), for what is only looked at: sites (size by
@@ -72,7 +68,7 @@ def set_numeric(model: mujoco.MjModel, name: str, values) -> None:
 
 
 def balanced(inertia) -> np.ndarray:
-    """Principal moments [n, 3] that satisfy the triangle inequality.
+    """Principal inertias [n, 3] that satisfy the triangle inequality, from any, kg m².
 
     Where the two smaller moments of a body add up to less than the largest, all three become their
     mean, as MuJoCo's compiler does with balanceinertia="true".
@@ -83,7 +79,7 @@ def balanced(inertia) -> np.ndarray:
 
 
 def ordered_ranges(ranges) -> np.ndarray:
-    """Joint ranges [n, 2] with lower < upper.
+    """Joint ranges [n, 2] with lower < upper, from any, rad.
 
     The design map can make the limits of a joint cross if its reference range is below 0.8 rad (no
     joint of Go2, MIT Humanoid or Golem, but e.g. ankles of small humanoids). C MuJoCo then applies
@@ -97,17 +93,22 @@ def ordered_ranges(ranges) -> np.ndarray:
     return np.where(crossed[:, None], tight, ranges)
 
 
-def write_mjcf(robot: Robot, embodiment, scale) -> str:
-    """MJCF text of one embodiment, see `build_model`. It compiles in any MuJoCo and holds what the
-    robot's file holds for a simulation: contacts of the feet, sensors, the home pose as keyframe.
+def write_mjcf(robot: Robot, embodiment: Embodiment, scale) -> str:
+    """MJCF text of one embodiment and its size factors [3], see `build_model`.
+
+    It compiles in any MuJoCo and holds what the robot's file holds for a simulation: contacts of
+    the feet, sensors, the home pose as keyframe.
 
     The text says in a comment what MJCF could not take over: inertias that violate the triangle
     inequality are balanced (`balanced`) and crossed joint limits are tightened (`ordered_ranges`).
     Compiling also recomputes MuJoCo's derived constants, which a design otherwise keeps from the
     reference. Meshes keep their size.
-    Raises ValueError if the text does not compile to the design, which a MJCF of the robot with
-    features that move its parts (such as fusestatic) can cause.
+
+    Raises:
+        ValueError: if the text does not compile to the design, which a MJCF of the robot with
+            features that move its parts (such as fusestatic) can cause.
     """
+    # What the design is, and what MJCF can hold of it.
     design = build_model(robot, embodiment, scale)
     fields = model_fields(embodiment)
     inertia = balanced(fields["body_inertia"])
@@ -118,8 +119,9 @@ def write_mjcf(robot: Robot, embodiment, scale) -> str:
     num_tightened = int(np.sum(np.any(ranges != fields["jnt_range"], axis=1)))
     fields |= {"body_inertia": inertia, "jnt_range": ranges}
 
+    # Bodies, motors, home pose, and what the robot says in custom entries.
     root = ElementTree.fromstring(_reference_text(robot))
-    _write_tree(root.find("worldbody"), design, fields)
+    _TreeWriter(design, fields).write_body(root.find("worldbody"))
     for element, gain, bias, force in zip(
         root.find("actuator"),
         fields["actuator_gainprm"],
@@ -138,6 +140,8 @@ def write_mjcf(robot: Robot, embodiment, scale) -> str:
         element = root.find(f"custom/numeric[@name='{name}']")
         element.set("data", _text(design.numeric(name).data))
     ElementTree.indent(root)
+
+    # The comment, and a test that the text is the design.
     notes = [
         f"A design of {robot.display_name}.",
         f"Inertias of {num_balanced} of {robot.num_bodies} bodies violated the triangle "
@@ -162,63 +166,69 @@ def _reference_text(robot: Robot) -> str:
     return spec.to_xml()
 
 
-def _write_tree(worldbody, model: mujoco.MjModel, fields: dict[str, np.ndarray]) -> None:
-    """Write the numbers of all bodies and what they hold. Ids follow the order of the document."""
-    next_id = {"body": 0, "geom": 0, "site": 0, "joint": 0, "camera": 0}
+class _TreeWriter:
+    """Writes the numbers of a design into the bodies of an MJCF tree and what they hold.
 
-    def take(kind: str) -> int:
-        next_id[kind] += 1
-        return next_id[kind] - 1
+    MuJoCo's ids follow the order of the document, so that counting elements gives their ids.
+    """
 
-    def pose(element, pos, quat):
-        for name in _ORIENTATIONS:
-            element.attrib.pop(name, None)
-        element.set("pos", _text(pos))
-        element.set("quat", _text(quat))
+    def __init__(self, model: mujoco.MjModel, fields: dict[str, np.ndarray]):
+        self.model, self.fields = model, fields
+        self.next_id = dict.fromkeys(("body", "geom", "site", "joint", "camera"), 0)
 
-    def write_body(element):
-        body = take("body")
+    def write_body(self, element) -> None:
+        """A body, by its element, and all below it."""
+        model, fields = self.model, self.fields
+        body = self._take("body")
+        if body > 0:
+            _set_pose(element, fields["body_pos"][body], fields["body_quat"][body])
         # All elements of a body come before its children in MuJoCo's order of ids.
         children = []
-        if body > 0:
-            pose(element, fields["body_pos"][body], fields["body_quat"][body])
         for child in list(_unframed(element)):
             if child.tag == "body":
                 children.append(child)
             elif child.tag == "geom":
-                write_geom(child, take("geom"))
+                self._write_geom(child, self._take("geom"))
             elif child.tag == "site":
-                site = take("site")
-                pose(child, fields["site_pos"][site], model.site_quat[site])
+                site = self._take("site")
+                _set_pose(child, fields["site_pos"][site], model.site_quat[site])
                 child.set("size", _text(model.site_size[site]))
             elif child.tag == "camera":
-                camera = take("camera")
-                pose(child, model.cam_pos[camera], model.cam_quat[camera])
+                camera = self._take("camera")
+                _set_pose(child, model.cam_pos[camera], model.cam_quat[camera])
             elif child.tag in ("joint", "freejoint"):
-                write_joint(child, take("joint"))
+                self._write_joint(child, self._take("joint"))
         if body > 0:
-            inertial = element.find("inertial")
-            if inertial is None:
-                inertial = ElementTree.Element("inertial")
-                element.insert(0, inertial)
-            inertial.attrib.pop("fullinertia", None)
-            pose(inertial, fields["body_ipos"][body], fields["body_iquat"][body])
-            inertial.set("mass", _text(fields["body_mass"][body]))
-            inertial.set("diaginertia", _text(fields["body_inertia"][body]))
+            self._write_inertial(element, body)
         for child in children:
-            write_body(child)
+            self.write_body(child)
 
-    def write_geom(element, geom):
-        count = _SIZES.get(mujoco.mjtGeom(model.geom_type[geom]))
+    def _take(self, kind: str) -> int:
+        self.next_id[kind] += 1
+        return self.next_id[kind] - 1
+
+    def _write_inertial(self, element, body: int) -> None:
+        fields = self.fields
+        inertial = element.find("inertial")
+        if inertial is None:
+            inertial = ElementTree.Element("inertial")
+            element.insert(0, inertial)
+        inertial.attrib.pop("fullinertia", None)
+        _set_pose(inertial, fields["body_ipos"][body], fields["body_iquat"][body])
+        inertial.set("mass", _text(fields["body_mass"][body]))
+        inertial.set("diaginertia", _text(fields["body_inertia"][body]))
+
+    def _write_geom(self, element, geom: int) -> None:
+        count = _SIZES.get(mujoco.mjtGeom(self.model.geom_type[geom]))
         if count is None:  # meshes and height fields keep their looks
             return
-        pose(element, fields["geom_pos"][geom], model.geom_quat[geom])
-        element.set("size", _text(fields["geom_size"][geom][:count]))
+        _set_pose(element, self.fields["geom_pos"][geom], self.model.geom_quat[geom])
+        element.set("size", _text(self.fields["geom_size"][geom][:count]))
 
-    def write_joint(element, joint):
-        if model.jnt_type[joint] == mujoco.mjtJoint.mjJNT_FREE:
+    def _write_joint(self, element, joint: int) -> None:
+        if self.model.jnt_type[joint] == mujoco.mjtJoint.mjJNT_FREE:
             return
-        dof = model.jnt_dofadr[joint]
+        fields, dof = self.fields, self.model.jnt_dofadr[joint]
         element.set("pos", _text(fields["jnt_pos"][joint]))
         element.set("axis", _text(fields["jnt_axis"][joint]))
         element.set("limited", "true")
@@ -227,7 +237,13 @@ def _write_tree(worldbody, model: mujoco.MjModel, fields: dict[str, np.ndarray])
         for name in ("damping", "armature", "frictionloss"):
             element.set(name, _text(fields[f"dof_{name}"][dof]))
 
-    write_body(worldbody)
+
+def _set_pose(element, pos, quat) -> None:
+    """Position and orientation of an element, instead of any that it had."""
+    for name in _ORIENTATIONS:
+        element.attrib.pop(name, None)
+    element.set("pos", _text(pos))
+    element.set("quat", _text(quat))
 
 
 def _unframed(element) -> Iterator:

@@ -1,4 +1,8 @@
-"""The parameters of a design: the blocks of the design vector and what each entry means."""
+"""The parameters of a design: the 26 blocks of the design vector and what each entry means.
+
+`BLOCKS` is the table behind the design map: which property, one entry for each of what, how far it
+can change. The formulas are in `phi`.
+"""
 
 from __future__ import annotations
 
@@ -12,19 +16,20 @@ import numpy as np
 
 from shapebody.robot.robot import Robot
 
-SOFT_LIMIT = 0.9  # soft limits span this fraction of a joint's range, about its midpoint
+SOFT_LIMIT = 0.9
+"""Soft limits span this fraction of a joint's range, about its midpoint."""
 
 
 class Block(NamedTuple):
     """One block of the design vector: one entry per `over` and component."""
 
-    key: str
-    title: str
-    kind: str
+    key: str  # its name in the code
+    title: str  # of the property, for readers
+    kind: str  # its row in the paper's figure of grouped changes, one of `KINDS`
     over: str  # "global", "body", "joint", "actuator" or "foot"
     components: tuple[str, ...]
     range: float  # range constant R, the relative or absolute change at f = 1
-    unit: str
+    unit: str  # of the property
 
     @property
     def adds(self) -> bool:
@@ -87,7 +92,6 @@ def block_slices(
     return slices
 
 
-# Rows of the paper's figure of grouped design changes, from top to bottom.
 KINDS = (
     "P gain",
     "D gain",
@@ -107,6 +111,7 @@ KINDS = (
     "Body geometry",
     "Foot geometry",
 )
+"""Rows of the paper's figure of grouped design changes, from top to bottom."""
 
 
 @dataclass(frozen=True)
@@ -165,31 +170,11 @@ def parameter_table(robot: Robot) -> list[Parameter]:
         "actuator": range(model.nu),
         "foot": robot.feet,
     }
-    dofs = model.jnt_dofadr[robot.joints]
-    references = {
-        "size": np.ones(3),
-        "coupled_mass": model.body_mass[1:],
-        "mass": model.body_mass[1:],
-        "inertia": model.body_inertia[1:],
-        "ipos": model.body_ipos[1:],
-        "pos": model.body_pos[1:],
-        "imu": model.site_pos[robot.imu_site],
-        "foot": model.geom_size[robot.feet],
-        "torque": model.actuator_forcerange[:, 1],
-        "nominal": robot.nominal,
-        "velocity": robot.velocity_limits,
-        "range": model.jnt_range[robot.joints],
-        "damping": model.dof_damping[dofs],
-        "armature": model.dof_armature[dofs],
-        "stiffness": model.jnt_stiffness[robot.joints],
-        "friction": model.dof_frictionloss[dofs],
-        "p_gain": np.array([robot.p_gain]),
-        "d_gain": np.array([robot.d_gain]),
-        "action_scale": np.array([robot.action_scale]),
-    }
+    references = _reference_values(robot)
     limits = soft_limits(model.jnt_range[robot.joints[robot.actuated]])
     table = []
     for block in BLOCKS:
+        # The physical values at f = -1 and f = +1, [2, n].
         length = len(ids[block.over]) * len(block.components)
         reference = references.get(block.key.removesuffix("_add"), np.zeros(length)).ravel()
         change = block.range * (np.ones(length) if block.adds else reference)
@@ -198,6 +183,8 @@ def parameter_table(robot: Robot) -> list[Parameter]:
             values = np.clip(values, limits[:, 0], limits[:, 1])
         elif block.key.endswith("_add"):
             values = np.maximum(values, 0)
+
+        # Their names.
         names = [
             (part_name(model, block.over, index) if index is not None else "global", component)
             for index in ids[block.over]
@@ -220,3 +207,31 @@ def parameter_table(robot: Robot) -> list[Parameter]:
                 )
             )
     return table
+
+
+def _reference_values(robot: Robot) -> dict[str, np.ndarray]:
+    """Values of the reference by key of their block, those of a factor and its offset once.
+    Rotations are missing: their angles start at 0."""
+    model = robot.model
+    dofs = model.jnt_dofadr[robot.joints]
+    return {
+        "size": np.ones(3),
+        "coupled_mass": model.body_mass[1:],
+        "mass": model.body_mass[1:],
+        "inertia": model.body_inertia[1:],
+        "ipos": model.body_ipos[1:],
+        "pos": model.body_pos[1:],
+        "imu": model.site_pos[robot.imu_site],
+        "foot": model.geom_size[robot.feet],
+        "torque": model.actuator_forcerange[:, 1],
+        "nominal": robot.nominal,
+        "velocity": robot.velocity_limits,
+        "range": model.jnt_range[robot.joints],
+        "damping": model.dof_damping[dofs],
+        "armature": model.dof_armature[dofs],
+        "stiffness": model.jnt_stiffness[robot.joints],
+        "friction": model.dof_frictionloss[dofs],
+        "p_gain": np.array([robot.p_gain]),
+        "d_gain": np.array([robot.d_gain]),
+        "action_scale": np.array([robot.action_scale]),
+    }

@@ -1,7 +1,7 @@
-"""The design space: the map Φ from a normalized vector f in [-1, 1]^d to an embodiment.
+"""The design space of a robot: its designs f in [-1, 1]^d, their names, and Φ of them.
 
-One number per continuous property of a robot, in 26 blocks (`BLOCKS`) of fixed order. f = 0 is the
-reference robot. Φ is smooth in f (up to clipping), so that ∂V/∂f can follow ∂V/∂Φ(f).
+One number per continuous property, in 26 blocks (`parameters.BLOCKS`) of fixed order; f = 0 is the
+reference robot. What Φ does is in `phi`.
 """
 
 from __future__ import annotations
@@ -42,9 +42,19 @@ MOST_STARTS = 2**63
 class DesignSpace:
     """The design space of one robot: f in [-1, 1]^d and the differentiable map Φ.
 
-    The directions of the small rotations (inertia frames, body frames, joint axes) are not part of
-    f. They are constants of the space, drawn from `axes_seed`; with `published_axes_of=f` they are
-    those with which the published design f was built.
+    Args:
+        robot: the reference robot.
+        axes_seed: the directions of the small rotations (inertia frames, body frames, joint axes)
+            are not part of f. They are constants of the space, drawn from this seed ...
+        published_axes_of: ... or, if given, those with which this published design [d] was built.
+
+    Attributes:
+        robot: the reference robot.
+        dim: d, the length of a design.
+        reference: the reference design, float32 zeros [d].
+        reference_robot: what Φ starts from, for `phi(space.reference_robot, f)`.
+        slices: where each block lies in f, by its key.
+        inertia_axes, body_axes, joint_axes: the directions, float64 [nb, 3], [nb, 3], [nj, 3].
 
     `space(f)` maps float32 f [..., d] to an `Embodiment` with the same leading axes, and can be
     jitted, vmapped and differentiated. It checks the length of f only; `validate` checks values.

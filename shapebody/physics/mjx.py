@@ -177,7 +177,7 @@ class MjxPhysics:
 
         Returns:
           (state, qpos (N, nq), qvel (N, nv), sensordata (N, nsensordata), finite (N,) bool), the
-          last four as in `shapebody.physics.protocol.Readings`.
+          last four as in `shapebody.physics.protocol.EngineOutput`.
 
         Raises:
           ValueError: ctrl of another shape.

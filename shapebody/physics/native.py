@@ -18,7 +18,7 @@ from shapebody.physics.protocol import (
     MAX_VALUE,
     MOST_SIMULATIONS,
     MOST_SUBSTEPS,
-    Readings,
+    EngineOutput,
     home_sensordata,
     prepare,
 )
@@ -143,7 +143,7 @@ class NativePhysics:
         qpos: np.ndarray | None = None,
         qvel: np.ndarray | None = None,
         running: np.ndarray | None = None,
-    ) -> Readings:
+    ) -> EngineOutput:
         """Advance every simulation by one control step.
 
         Args:
@@ -154,8 +154,8 @@ class NativePhysics:
             costs nothing. None advances all.
 
         Returns:
-          Readings. `qpos`, `qvel` and `sensordata` are the live arrays, so copy what must survive
-          the next call; `finite` is a new array.
+          EngineOutput. `qpos`, `qvel` and `sensordata` are the live arrays, so copy what must
+          survive the next call; `finite` is a new array.
 
         Raises:
           ValueError: arrays of other shapes.
@@ -184,7 +184,7 @@ class NativePhysics:
             self.set_state(failed, self.robot.home, np.zeros(self.model.nv))
             sensordata = sensordata.copy()
             sensordata[failed] = self._home_sensordata
-        return Readings(self.qpos, self.qvel, sensordata, finite)
+        return EngineOutput(self.qpos, self.qvel, sensordata, finite)
 
     def get_model(self, env: int) -> mujoco.MjModel:
         """A copy of the model that simulation `env` runs, with its design."""

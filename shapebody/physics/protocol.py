@@ -28,7 +28,7 @@ MAX_VALUE = 1e10
 """Largest magnitude of a position, velocity or acceleration that MuJoCo takes for a valid one."""
 
 
-class Readings(NamedTuple):
+class EngineOutput(NamedTuple):
     """What an engine returns for N environments after a control step.
 
     A simulation that failed has `finite` False, the home pose, zero velocity and the sensors of

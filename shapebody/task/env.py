@@ -36,7 +36,7 @@ from shapebody.task.batch import Batch, RobotGroup
 from shapebody.task.config import TaskConfig
 from shapebody.task.episode import Episode, Outcome
 from shapebody.task.randomization import draw_designs
-from shapebody.task.trajectory import Policy, StepRecord, Trajectory
+from shapebody.task.trajectory import PolicyFunction, StepRecord, Trajectory
 
 MOST_ENVIRONMENTS = 2**20
 """Largest batch."""
@@ -52,7 +52,7 @@ class Locomotion:
         robots: a Robot or several; environments are shared out evenly, in order.
         num_envs: size N of the batch.
         engine: "native" (C MuJoCo), "mjx", or "auto": native on a CPU, MJX otherwise.
-        config: the task's settings.
+        config: the task's settings; by default `TaskConfig()`.
         sizes: padding; by default the largest of `robots`.
         auto_reset: start a new episode, with a new random design, when one ends.
             Without it a finished environment goes on: its body moves, rewards still come, and
@@ -60,6 +60,12 @@ class Locomotion:
             `terminated` or `truncated`, ignore what follows, and `reset` or `restart` it.
         threads: physics threads of the native engine, 0 for all cores.
         physics_options: passed on to the engine's constructor.
+
+    Attributes:
+        robots, num_envs, engine, sizes: as given; the engine is "native" or "mjx".
+        batch, config, groups, auto_reset: the environments as the engines' loops take them.
+        design_dim: D, the largest robot's d, to which designs are padded.
+        physics_state: with MJX one PhysicsState per robot, which `rollout` continues and replaces.
 
     The function that starts episodes is compiled for each robot, some seconds each; it then holds
     about 700 memory maps, of the 65,530 that Linux grants a process.
@@ -96,8 +102,7 @@ class Locomotion:
         options = {} if physics_options is None else physics_options
         require_kind("physics_options", options, dict, "of arguments of the engine, by name")
         self.robots, self.num_envs, self.engine = tuple(robots), num_envs, engine
-        self.sizes = sizes
-        self.design_dim = max(robot.design_dim for robot in robots)
+        self.sizes, self.design_dim = sizes, max(robot.design_dim for robot in robots)
         simulate = simulator(engine, threads, options)
         bounds = np.linspace(0, num_envs, len(robots) + 1).astype(int)
         groups = []
@@ -108,7 +113,7 @@ class Locomotion:
         self._take(Batch(config, tuple(groups), auto_reset))
 
     def _take(self, batch: Batch) -> None:
-        """Work on `batch`. Its functions are compiled when they are first called."""
+        """Work on `batch`; its functions are compiled when they are first called."""
         self.batch = batch
         self._observe = jax.jit(batch.observe)
         self._account = native_rollout.compiled_account(batch)
@@ -154,21 +159,20 @@ class Locomotion:
             ValueError: for designs of another shape, outside [-1, 1] or not finite, and for a
                 coefficient outside [0, 1].
         """
+        # Arguments: a key, c and a streak of every episode.
         n = self.num_envs
         require_number("coefficient", coefficient, 0, 1)
         require_flag("spread", spread)
         if key is not None or keys is None:
             require_key("key", key)
-        if keys is not None:
-            require_key("keys", keys, (n,))
-        else:
-            keys = jax.random.split(key, n)
+        keys = jax.random.split(key, n) if keys is None else require_key("keys", keys, (n,))
         coefficients = jnp.full(n, coefficient, jnp.float32)
         streaks = jnp.zeros(n, jnp.int32)
+
+        # Designs, and with them bodies, poses and commands.
         if designs is None:
-            designs = np.asarray(
-                draw_designs(keys, coefficients, self.design_dim, self.config.design_radius)
-            )
+            radius = self.config.design_radius
+            designs = np.asarray(draw_designs(keys, coefficients, self.design_dim, radius))
         else:
             designs = self._validated(designs, n)
         states, physics_states = [], []
@@ -184,10 +188,10 @@ class Locomotion:
                 states.append(state)
                 physics_states.append(physics)
         state = jax.tree.map(lambda *x: jnp.concatenate(x), *states)
+
         if spread:
-            horizon = jax.random.randint(
-                jax.random.fold_in(key, 1), (n,), 1, self.config.horizon + 1
-            )
+            horizon_key = jax.random.fold_in(key, 1)
+            horizon = jax.random.randint(horizon_key, (n,), 1, self.config.horizon + 1)
             state = replace(state, horizon=horizon)
         self.physics_state = tuple(physics_states)
         return state
@@ -261,7 +265,8 @@ class Locomotion:
             rows: [R] numbers of the environments, ascending.
             keys: [R] one key per new episode.
             designs: [R, d], padded to the largest robot's d; None draws them as `reset` does.
-            coefficient: c of the new episodes, one number or [R]; `streak` likewise.
+            coefficient: c of the new episodes in [0, 1], one number or [R].
+            streak: successes (+) or failures (-) in a row before them, one integer or [R].
 
         Returns:
             The new state.
@@ -269,6 +274,7 @@ class Locomotion:
         Raises:
             ValueError: for designs of another shape, outside [-1, 1] or not finite.
         """
+        self._require_native("restart")
         require_kind("state", state, Episode, "what reset, step or rollout returned")
         rows = require_array("rows", rows, kinds="iu")
         if rows.ndim != 1:
@@ -279,33 +285,25 @@ class Locomotion:
                 f"0 to {self.num_envs - 1}"
             )
         keys = np.asarray(require_key("keys", keys, rows.shape))
-        for name, value, kinds, low, high in (
-            ("coefficient", coefficient, "fiu", 0, 1),
-            ("streak", streak, "iu", -(2**31), 2**31 - 1),
-        ):
-            values = require_array(name, value, kinds=kinds)
-            right = values.shape in ((), rows.shape) and np.all((values >= low) & (values <= high))
-            if not right:
-                expected = f"one number from {low} to {high}, or one for each of rows"
-                raise refuse(name, value, expected)
+        coefficient = _one_per_row("coefficient", coefficient, rows, "fiu", 0, 1, np.float32)
+        streak = _one_per_row("streak", streak, rows, "iu", -(2**31), 2**31 - 1, np.int32)
         if designs is not None:
             designs = self._validated(designs, len(rows), rows)
-        coefficient = np.broadcast_to(np.asarray(coefficient, np.float32), rows.shape)
-        streak = np.broadcast_to(np.asarray(streak, np.int32), rows.shape)
         return native_rollout.restart(self.batch, state, rows, keys, designs, coefficient, streak)
 
     # ------------------------------------------------------------------ rollouts
 
     def rollout(
-        self, policy: Policy, params, state: Episode, key: jax.Array, length: int
+        self, policy: PolicyFunction, params, state: Episode, key: jax.Array, length: int
     ) -> tuple[Episode, Trajectory]:
         """Run `policy` for `length` control steps in all environments.
 
         Args:
-            policy: pure function, see `Policy`. The same object must be passed in every
-                call: one compilation belongs to it.
+            policy: pure function, see `trajectory.PolicyFunction`. The same object must be passed
+                in every call: one compilation belongs to it.
             params: its parameters.
-            state: from `reset` or the last rollout.
+            state: from `reset` or the last rollout. With MJX it must be the latest: the state of
+                the physics that belongs to it is `physics_state`.
             key: PRNG key for the policy's randomness.
             length: number T of control steps.
 
@@ -315,14 +313,15 @@ class Locomotion:
         self._check_call(policy, state, key)
         require_integer("length", length, 1, 1_000_000)
         if self.engine == "mjx":
-            rollout = self._rollout(policy, length)
+            rollout = self._compiled(mjx_rollout.compiled_rollout, policy, length)
             state, self.physics_state, trajectory = rollout(params, state, self.physics_state, key)
             return state, trajectory
-        functions = self._act(policy), self._account, self._observe
+        act = self._compiled(native_rollout.compiled_act, policy)
+        functions = act, self._account, self._observe
         return native_rollout.rollout(self.batch, *functions, params, state, key, length)
 
     def step(
-        self, policy: Policy, params, state: Episode, key: jax.Array, running=None
+        self, policy: PolicyFunction, params, state: Episode, key: jax.Array, running=None
     ) -> tuple[Episode, StepRecord, Outcome]:
         """Native engine: one control step of `policy` in all environments.
 
@@ -334,39 +333,47 @@ class Locomotion:
         Returns:
             The new state, the StepRecord (NumPy arrays), and the Outcome.
         """
+        self._require_native("step")
         self._check_call(policy, state, key)
         if running is not None:
             running = require_array("running", running, (self.num_envs,), kinds="b")
+        act = self._compiled(native_rollout.compiled_act, policy)
         return native_rollout.control_step(
-            self.batch, self._act(policy), self._account, params, state, key, running
+            self.batch, act, self._account, params, state, key, running
         )
+
+    def _require_native(self, method: str) -> None:
+        if self.engine != "native":
+            raise ValueError(
+                f"{method} is for the native engine, and this batch runs on {self.engine!r}; "
+                "use rollout, or create it with engine='native'"
+            )
 
     def _check_call(self, policy, state, key) -> None:
         require_function("policy", policy)
         require_kind("state", state, Episode, "what reset, step or rollout returned")
         require_key("key", key)
 
-    def _act(self, policy: Policy) -> Callable:
-        """Native engine: the compiled function that belongs to a policy."""
-        if policy not in self._of_policy:
-            self._of_policy[policy] = native_rollout.compiled_act(self.batch, policy)
-        return self._of_policy[policy]
-
-    def _rollout(self, policy: Policy, length: int) -> Callable:
-        """MJX: the compiled function that belongs to a policy and a number of steps."""
-        if (policy, length) not in self._of_policy:
-            compiled = mjx_rollout.compiled_rollout(self.batch, policy, length)
-            self._of_policy[policy, length] = compiled
-        return self._of_policy[policy, length]
+    def _compiled(self, compiled: Callable, *key) -> Callable:
+        """compiled(batch, *key), where `key` begins with a policy; made once for each."""
+        if key not in self._of_policy:
+            self._of_policy[key] = compiled(self.batch, *key)
+        return self._of_policy[key]
 
     # ------------------------------------------------------------------ exact resume
 
     def physics_arrays(self) -> list[dict[str, np.ndarray]]:
         """The physics state of every robot's environments, for `restore` (native engine)."""
+        self._require_native("physics_arrays")
         return [{k: np.array(v) for k, v in group.physics.state().items()} for group in self.groups]
 
     def restore(self, state: Episode, arrays: list[dict[str, np.ndarray]]) -> None:
-        """Continue from a saved `state` and its `physics_arrays` (native engine)."""
+        """Continue from a saved `state` and its `physics_arrays` (native engine).
+
+        Raises:
+            ValueError: for arrays of other robots or of another number of environments.
+        """
+        self._require_native("restore")
         require_kind("state", state, Episode, "what reset, step or rollout returned")
         arrays = require_list("arrays", arrays)
         if len(arrays) != len(self.groups):
@@ -381,3 +388,11 @@ class Locomotion:
             _, embodiments = group.bodies(designs[group.slice, : group.space.dim])
             group.physics.set_designs(np.arange(group.count), embodiments)
             group.physics.restore(saved)
+
+
+def _one_per_row(name: str, value, rows, kinds: str, low: int, high: int, dtype) -> np.ndarray:
+    """One number for each of `rows`, from as many or one; ValueError if any is out of range."""
+    values = require_array(name, value, kinds=kinds)
+    if values.shape not in ((), rows.shape) or np.any((values < low) | (values > high)):
+        raise refuse(name, value, f"one number from {low} to {high}, or one for each of rows")
+    return np.broadcast_to(np.asarray(value, dtype), rows.shape)

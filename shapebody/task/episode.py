@@ -2,7 +2,7 @@
 
     start -> [observe -> act -> control -> physics -> advance] x horizon
 
-Every function treats one environment and is vmapped by `env`.
+Every function treats one environment; `batch` maps it over all of them.
 """
 
 from dataclasses import dataclass, replace
@@ -147,6 +147,7 @@ def control(config: TaskConfig, episode: Episode, action):
 
 def advance(config: TaskConfig, episode: Episode, readings: Readings):
     """Account for one control step of physics: (episode, Outcome)."""
+    # What is read: the old values where physics failed, velocities clipped to their limits.
     d = episode.descriptions
     finite = readings.finite
     readings = jax.tree.map(
@@ -162,6 +163,7 @@ def advance(config: TaskConfig, episode: Episode, readings: Readings):
     readings = replace(readings, joint_velocity=velocity, finite=finite)
     contact = observations.foot_contact(readings, d)
 
+    # Reward; nothing for a step in which physics failed.
     moment = rewards.Moment(
         readings=readings,
         descriptions=d,
@@ -177,11 +179,13 @@ def advance(config: TaskConfig, episode: Episode, readings: Readings):
     terms = rewards.reward_terms(moment)
     reward = jnp.where(finite, jnp.nan_to_num(rewards.combine(terms, episode.coefficient)), 0.0)
 
+    # End: by a fall (the lower c, the sooner), too much speed, failed physics, or the horizon.
     step = episode.step + 1
     floor = (1 - episode.coefficient) * config.termination_height * d.imu_height
     terminated = ~finite | too_fast | (readings.imu_height < floor)
     truncated = (step >= episode.horizon) & ~terminated
 
+    # Tracking error, by which the curriculum may judge the episode.
     limit = randomization.command_limit(config, d)
     difference = jnp.abs(readings.linear_velocity[:2] - episode.command[:2])
     error = jnp.mean(jnp.minimum(difference, 2 * limit))

@@ -11,10 +11,10 @@ import jax.numpy as jnp
 from shapebody.task.batch import Batch, RobotGroup
 from shapebody.task.episode import Episode
 from shapebody.task.randomization import draw_designs
-from shapebody.task.trajectory import Policy, assembled, step_record
+from shapebody.task.trajectory import PolicyFunction, assembled, step_record
 
 
-def compiled_rollout(batch: Batch, policy: Policy, length: int) -> Callable:
+def compiled_rollout(batch: Batch, policy: PolicyFunction, length: int) -> Callable:
     """A rollout of `length` control steps: (params, state, physics, key) -> (state, physics,
     Trajectory), where `physics` is a tuple of one `PhysicsState` per group."""
     observe = jax.jit(batch.observe)

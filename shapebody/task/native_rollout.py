@@ -20,12 +20,12 @@ from shapebody.task.batch import RESET_SLOTS, Batch, RobotGroup
 from shapebody.task.config import TaskConfig
 from shapebody.task.episode import Episode
 from shapebody.task.randomization import draw_designs
-from shapebody.task.trajectory import Policy, assembled, step_record
+from shapebody.task.trajectory import PolicyFunction, assembled, step_record
 
 # ------------------------------------------------------------------ one control step
 
 
-def compiled_act(batch: Batch, policy: Policy) -> Callable:
+def compiled_act(batch: Batch, policy: PolicyFunction) -> Callable:
     """The step before physics: (params, state, key) -> (the fields of the state that change,
     (joint targets, trunk velocities, joint velocities), observation, action, extra)."""
 

@@ -1,9 +1,4 @@
-"""Observations of one environment (Appendix A), normalized by fixed divisors.
-
-The divisors of what the policy sees are those of the authors' published policies, and so is the
-gait clock, which the paper does not mention. Those of feet and privileged observations follow
-the authors' earlier environment.
-"""
+"""Observations of one environment (Appendix A), normalized by fixed divisors (`SCALES`)."""
 
 from dataclasses import dataclass
 
@@ -35,6 +30,22 @@ class Observation:
 
 COMMAND = slice(3, 6)
 """Where the command is in the general observations."""
+
+SCALES = {
+    "joint_position": 6.5,  # rad, of the difference from the nominal position
+    "joint_velocity": 180.0,  # rad/s
+    "action": 10.0,
+    "angular_velocity": 50.0,  # rad/s, clipped to +-1
+    "foot_time": 2.5,  # s: times from 0 to 5 s become -1 to 1, and are clipped there
+    "linear_velocity": 10.0,  # m/s, clipped to +-1
+    "height": 5.0,  # m: heights from 0 to 10 m become -1 to 1, and are clipped there
+}
+"""What observations are divided by. The first four, which the policy sees, are those of the
+authors' published policies, and so is the gait clock, which the paper does not mention. The others
+follow the authors' earlier environment."""
+
+LIMIT = 10.0
+"""Every observation is clipped to +-this."""
 
 
 def foot_contact(readings: Readings, descriptions: Descriptions):
@@ -74,7 +85,15 @@ def observe(
     air_time,
     coefficient,
 ) -> Observation:
-    """The observation of one environment; `clock` is the gait phase in radians."""
+    """The observation of one environment.
+
+    Args:
+        key: PRNG key of the noise, whose widths `config` has and `coefficient` scales.
+        command: [3]; keep_nominal: [J] 0/1; last_action: [J].
+        clock: gait phase, rad.
+        contact: [F] 0/1; ground_time, air_time: [F] s.
+    """
+    # Noise on what joints and the IMU measure.
     keys = jax.random.split(key, 4)
     mask = descriptions.joint_mask
 
@@ -86,33 +105,25 @@ def observe(
     velocity = noisy(keys[1], readings.joint_velocity, config.noise_joint_velocity)
     angular = noisy(keys[2], readings.angular_velocity, config.noise_angular_velocity)
     gravity = noisy(keys[3], -up_axis(readings.imu_quat), config.noise_gravity)
-    joints = jnp.stack(
-        [(position - descriptions.nominal) / 6.5, velocity / 180, last_action / 10, keep_nominal],
-        -1,
-    )
-    feet = jnp.stack(
-        [
-            2 * contact - 1,
-            jnp.clip(ground_time / 2.5 - 1, -1, 1),
-            jnp.clip(air_time / 2.5 - 1, -1, 1),
-        ],
-        -1,
-    )
+
+    # Normalized, joint by joint, foot by foot, and of the whole robot.
+    scale = SCALES
+    position = (position - descriptions.nominal) / scale["joint_position"]
+    velocity, action = velocity / scale["joint_velocity"], last_action / scale["action"]
+    joints = jnp.stack([position, velocity, action, keep_nominal], -1)
+    on_ground = jnp.clip(ground_time / scale["foot_time"] - 1, -1, 1)
+    in_air = jnp.clip(air_time / scale["foot_time"] - 1, -1, 1)
+    feet = jnp.stack([2 * contact - 1, on_ground, in_air], -1)
     phases = jnp.stack([clock, clock - jnp.pi])
-    general = jnp.concatenate(
-        [jnp.clip(angular / 50, -1, 1), command, jnp.sin(phases), jnp.cos(phases), gravity]
-    )
-    privileged = jnp.concatenate(
-        [
-            jnp.clip(readings.linear_velocity / 10, -1, 1),
-            jnp.clip(readings.imu_height[None] / 5 - 1, -1, 1),
-            coefficient[None],
-        ]
-    )
+    angular = jnp.clip(angular / scale["angular_velocity"], -1, 1)
+    general = jnp.concatenate([angular, command, jnp.sin(phases), jnp.cos(phases), gravity])
+    linear = jnp.clip(readings.linear_velocity / scale["linear_velocity"], -1, 1)
+    height = jnp.clip(readings.imu_height[None] / scale["height"] - 1, -1, 1)
+    privileged = jnp.concatenate([linear, height, coefficient[None]])
     observation = Observation(
         joints=joints * mask[:, None],
         feet=feet * descriptions.foot_mask[:, None],
         general=general,
         privileged=privileged,
     )
-    return jax.tree.map(lambda x: jnp.clip(jnp.nan_to_num(x), -10.0, 10.0), observation)
+    return jax.tree.map(lambda x: jnp.clip(jnp.nan_to_num(x), -LIMIT, LIMIT), observation)

@@ -1,6 +1,6 @@
-"""Everything that is drawn at random: commands, initial states, delay, pushes, noise.
+"""Everything that is drawn at random: designs, commands, initial states, delay, pushes.
 
-All functions treat one environment; `env` vmaps them.
+All functions but `draw_designs` treat one environment; `batch` maps them over all of them.
 """
 
 from functools import partial
@@ -21,7 +21,7 @@ def command_limit(config: TaskConfig, descriptions: Descriptions):
 
 
 def draw_command(config: TaskConfig, key, limit):
-    """A new command (vx, vy, yaw rate), float32[3]."""
+    """A new command (vx, vy m/s, yaw rate rad/s), float32[3], each within +-limit."""
     velocity_key, all_key, single_key = jax.random.split(key, 3)
     command = jax.random.uniform(velocity_key, (3,), minval=-1.0, maxval=1.0) * limit
     command = jnp.where(jnp.abs(command) < config.command_dead_zone * limit, 0.0, command)
@@ -63,7 +63,7 @@ def draw_delay(config: TaskConfig, key):
 
 
 def delayed_action(config: TaskConfig, key, actions, delay, mixed, coefficient):
-    """The action that reaches the motors now; `actions` is [3, J], newest first."""
+    """The action [J] that reaches the motors now; `actions` is [3, J], newest first."""
     if config.action_delay is None:
         delay = jnp.where(mixed, jax.random.bernoulli(key).astype(jnp.int32), delay)
     late = (delay == 1) & (coefficient > 0)
@@ -71,7 +71,7 @@ def delayed_action(config: TaskConfig, key, actions, delay, mixed, coefficient):
 
 
 def push(config: TaskConfig, key, trunk_velocity, total_mass, coefficient):
-    """The trunk velocity [6] after a possible push."""
+    """The trunk velocity [6] (m/s, rad/s) after a possible push; total_mass: kg."""
     if config.push_probability == 0.0:
         return trunk_velocity
     when_key, size_key, add_key = jax.random.split(key, 3)

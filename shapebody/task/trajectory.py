@@ -14,7 +14,7 @@ from shapebody.design.descriptions import Descriptions
 from shapebody.task.episode import Episode, Outcome
 from shapebody.task.observations import Observation
 
-Policy = Callable[[Any, jax.Array, Descriptions, Observation], tuple[jax.Array, Any]]
+PolicyFunction = Callable[[Any, jax.Array, Descriptions, Observation], tuple[jax.Array, Any]]
 """(params, key, descriptions[N], observation[N]) -> (action[N, J], extra pytree[N])."""
 
 
