@@ -53,6 +53,7 @@ from shapebody.task.env import Trajectory
 from shapebody.training.update import Learner
 
 INTERNAL = {
+    "commands": "the command line, see the test of its words",
     "agent.description": "reads and writes agent.json, for `agent.store`",
     "training.progress": "shows and records what `training.trainer` hands over",
     "training.replacing": "looks at folders of `training.train`",

@@ -238,10 +238,10 @@ COMMANDS = {
 
 def test_the_table_of_commands_is_whole():
     """Settings of configurations are samples; what the commands add to them is all here."""
-    from shapebody import __main__
+    from shapebody import commands
 
-    assert COMMANDS.keys() == __main__.COMMANDS.keys()
-    for name, make in __main__.COMMANDS.items():
+    assert COMMANDS.keys() == commands.COMMANDS.keys()
+    for name, make in commands.COMMANDS.items():
         command, _ = make(["unitree_go2"])
         own = [x for x in inspect.signature(command).parameters if x not in ("settings", "critic")]
         flags = {x.replace("_", "-") for x in own} - {"state-only", "replace"}
