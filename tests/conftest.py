@@ -4,6 +4,7 @@ import gc
 
 import jax
 import pytest
+from tiny import quick_compilation, tiny_agent, tiny_robot
 
 from shapebody.runtime import enable_compilation_cache
 
@@ -17,3 +18,22 @@ def release_programs():
     yield
     jax.clear_caches()
     gc.collect()
+
+
+@pytest.fixture(scope="module")
+def quick():
+    """For a whole file: programs are little optimized, which compiles them sooner."""
+    with quick_compilation():
+        yield
+
+
+@pytest.fixture(scope="session")
+def robot(tmp_path_factory):
+    """A trunk on two legs of one joint."""
+    return tiny_robot(tmp_path_factory.mktemp("robot"))
+
+
+@pytest.fixture(scope="session")
+def agent(robot):
+    """An agent of random networks for that robot."""
+    return tiny_agent(robot)

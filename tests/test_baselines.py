@@ -10,7 +10,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from tiny import quick_compilation, tiny_agent, tiny_robot
 
 from shapebody.agent.store import load_agent
 from shapebody.design.space import DesignSpace
@@ -92,10 +91,7 @@ def uniform(*shape, seed=0, limit=1.0):
     return np.random.default_rng(seed).uniform(-limit, limit, shape).astype(np.float32)
 
 
-@pytest.fixture(scope="module", autouse=True)
-def quick():
-    with quick_compilation():
-        yield
+pytestmark = pytest.mark.usefixtures("quick")
 
 
 # every method
@@ -555,16 +551,6 @@ def test_bo_begins_with_the_start_and_sobol_points():
 
 
 # with critics
-
-
-@pytest.fixture(scope="module")
-def robot(tmp_path_factory):
-    return tiny_robot(tmp_path_factory.mktemp("robot"))
-
-
-@pytest.fixture(scope="module")
-def agent(robot):
-    return tiny_agent(robot)
 
 
 @every_method(without=["vgds", "penalty-only"])

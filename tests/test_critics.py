@@ -5,7 +5,7 @@ from dataclasses import replace
 import jax
 import numpy as np
 import pytest
-from tiny import quick_compilation, tiny_agent, tiny_robot
+from tiny import tiny_agent
 
 from shapebody.design.space import DesignSpace
 from shapebody.evaluation.evaluate import EvaluationConfig, evaluate
@@ -17,15 +17,7 @@ from shapebody.task.config import TaskConfig
 SETTING = dict(starts=2, first_start=5, episodes=3, horizon=12)
 
 
-@pytest.fixture(scope="module", autouse=True)
-def quick():
-    with quick_compilation():
-        yield
-
-
-@pytest.fixture(scope="module")
-def robot(tmp_path_factory):
-    return tiny_robot(tmp_path_factory.mktemp("robot"))
+pytestmark = pytest.mark.usefixtures("quick")
 
 
 @pytest.fixture(scope="module")

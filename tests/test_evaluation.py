@@ -3,7 +3,6 @@
 import jax
 import numpy as np
 import pytest
-from tiny import quick_compilation, tiny_agent, tiny_robot
 
 from shapebody.design.space import DesignSpace
 from shapebody.evaluation.evaluate import EvaluationConfig, evaluate
@@ -17,25 +16,12 @@ TASK = TaskConfig.evaluation(horizon=HORIZON)
 CONFIG = EvaluationConfig(episodes=4, task=TASK, num_envs=8)
 
 
-@pytest.fixture(scope="module", autouse=True)
-def quick():
-    with quick_compilation():
-        yield
-
-
-@pytest.fixture(scope="module")
-def robot(tmp_path_factory):
-    return tiny_robot(tmp_path_factory.mktemp("robot"))
+pytestmark = pytest.mark.usefixtures("quick")
 
 
 @pytest.fixture(scope="module")
 def space(robot):
     return DesignSpace(robot)
-
-
-@pytest.fixture(scope="module")
-def agent(robot):
-    return tiny_agent(robot)
 
 
 def native(agent, robot, designs, config=CONFIG, **arguments):

@@ -6,7 +6,6 @@ import numpy as np
 import optax
 import pytest
 from test_baselines import Quadratic, draws
-from tiny import quick_compilation
 
 from shapebody.optimizers.ars import ARSConfig, ars
 from shapebody.optimizers.de import DEConfig, de
@@ -18,10 +17,7 @@ algorithms = pytest.importorskip("evosax.algorithms")
 RUNS = 64
 
 
-@pytest.fixture(scope="module", autouse=True)
-def quick():
-    with quick_compilation():
-        yield
+pytestmark = pytest.mark.usefixtures("quick")
 
 
 def quadratic(size):

@@ -8,7 +8,6 @@ import jax
 import mujoco
 import numpy as np
 import pytest
-from tiny import quick_compilation
 
 from shapebody.design.descriptions import Sizes
 from shapebody.design.phi import MODEL_FIELDS
@@ -34,10 +33,7 @@ QUIET = dict(
 )
 
 
-@pytest.fixture(scope="module", autouse=True)
-def quick():
-    with quick_compilation():
-        yield
+pytestmark = pytest.mark.usefixtures("quick")
 
 
 def test_the_table_is_the_papers():

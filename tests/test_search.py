@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from tiny import quick_compilation, tiny_agent, tiny_robot
+from tiny import tiny_agent, tiny_robot
 
 from shapebody.design.descriptions import describe
 from shapebody.design.space import DesignSpace
@@ -55,25 +55,12 @@ def adam_reference(gradient, f, steps, rate=0.05, limit=0.1):
     return np.stack(rows)
 
 
-@pytest.fixture(scope="module", autouse=True)
-def quick():
-    with quick_compilation():
-        yield
-
-
-@pytest.fixture(scope="module")
-def robot(tmp_path_factory):
-    return tiny_robot(tmp_path_factory.mktemp("robot"))
+pytestmark = pytest.mark.usefixtures("quick")
 
 
 @pytest.fixture(scope="module")
 def space(robot):
     return DesignSpace(robot)
-
-
-@pytest.fixture(scope="module")
-def agent(robot):
-    return tiny_agent(robot)
 
 
 @pytest.fixture(scope="module")

@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 from PIL import Image
 from test_networks import published_layers, write_published
-from tiny import quick_compilation, tiny_agent, tiny_robot
 
 from shapebody.agent.store import load_agent
 from shapebody.design.space import DesignSpace
@@ -36,10 +35,7 @@ RUNS = (PENALTY_ONLY, Run("vgds", 20.0), Run("cem"), Run("vgds", 100.0, "referen
 SETTING = dict(starts=2, episodes=3, horizon=12, iterations=2)
 
 
-@pytest.fixture(scope="module", autouse=True)
-def quick():
-    with quick_compilation():
-        yield
+pytestmark = pytest.mark.usefixtures("quick")
 
 
 @pytest.fixture
@@ -47,16 +43,6 @@ def results(tmp_path, monkeypatch):
     monkeypatch.setenv("SHAPEBODY_DATA", str(tmp_path))
     monkeypatch.setenv("SHAPEBODY_SCALE", "reduced")
     return tmp_path / "results"
-
-
-@pytest.fixture(scope="module")
-def robot(tmp_path_factory):
-    return tiny_robot(tmp_path_factory.mktemp("robot"))
-
-
-@pytest.fixture(scope="module")
-def agent(robot):
-    return tiny_agent(robot)
 
 
 def test_runs_are_the_papers():
