@@ -16,9 +16,9 @@ from shapebody.evaluation.statistics import paired_gain
 from shapebody.files import data_dir
 from shapebody.optimizers.objective import Objective
 from shapebody.optimizers.search import METHODS, search
-from shapebody.reproduction import critic_ablation, paper, value_studies
 from shapebody.reproduction import design_study as reproduction_design_study
 from shapebody.reproduction import gains as reproduction_gains
+from shapebody.reproduction import paper, value_studies
 from shapebody.reproduction import results as reproduction_results
 from shapebody.reproduction import scale as reproduction_scale
 from shapebody.reproduction.design_study import (
@@ -350,59 +350,6 @@ def test_readme_states_the_example_and_the_mean():
         (*ten, "over ten starts from {:.1f} to {:.1f} ({:.1f})"),
     ):
         assert words.format(start, end, alone) in text
-
-
-def test_what_notebook_04_says_of_the_two_critics():
-    path = Path(__file__).parents[1] / "notebooks" / "04_value_gradient_design.ipynb"
-    text = path.read_text()
-    rows, difference = {}, {}
-    for name in ("unitree_go2", "mit_humanoid"):
-        file = data_dir() / "results" / f"critic_tasks_{name}.json"
-        found = [r for r in reproduction_results.stored_result(file)["records"] if "returns" in r]
-        for row in critic_ablation.critic_gains(found):
-            rows[name, row["critic"], row["trust_region"]] = row
-        for value in (20.0, 100.0):
-            newer, older = (
-                [r["returns"] for r in found if (r["critic"], r["trust_region"]) == (kind, value)]
-                for kind in ("task of the evaluation", "task of the training")
-            )
-            difference[name, value] = paired_gain(newer, older)
-    assert "finds better bodies at λ = 20 and bodies as good at λ = 100" in text
-    assert difference["unitree_go2", 20.0].low > 0
-    assert difference["unitree_go2", 100.0].low < 0 < difference["unitree_go2", 100.0].high
-    assert "before, all three sizes shrank, now only the height does" in text
-    for value in (20.0, 100.0):
-        newer, older = (
-            rows["unitree_go2", kind, value]
-            for kind in ("task of the evaluation", "task of the training")
-        )
-        assert max(older["size"]) < 0 and min(newer["size"][:2]) > -0.01 and newer["size"][2] < 0
-        assert newer["tracking_error"] < older["tracking_error"]
-    assert "better at λ = 100 and worse at λ = 20, where it makes the robot worse" in text
-    assert difference["mit_humanoid", 100.0].low > 0 > difference["mit_humanoid", 20.0].high
-    assert rows["mit_humanoid", "task of the evaluation", 20.0]["high"] < 0
-
-
-def test_what_notebook_02_says_of_the_authors_policies():
-    text = (Path(__file__).parents[1] / "notebooks" / "02_locomotion_task.ipynb").read_text()
-    gains, reference = {}, {}
-    for name in paper.ROBOTS:
-        path = data_dir() / "results" / f"published_policy_{name}.json"
-        first, *starts = reproduction_results.stored_result(path)["records"]
-        starts = np.array([record["returns"] for record in starts])
-        gains[name] = paired_gain(np.broadcast_to(first["returns"], starts.shape), starts)
-        own = reproduction_results.stored_result(
-            data_dir() / "results" / f"design_study_{name}.json"
-        )
-        mine = [r for r in own["records"] if (r["origin"], r["method"]) == ("reference", "none")]
-        reference[name] = mine[0]["return"] - first["return"]
-    printed = {name: paper.SINGLE_ROBOT[name]["f_ref"] for name in paper.ROBOTS}
-    assert "For the Go2 and the MIT Humanoid the paper's number lies in our interval" in text
-    assert "for the Golem it is above it" in text
-    for name in ("unitree_go2", "mit_humanoid"):
-        assert gains[name].low < printed[name] < gains[name].high and reference[name] < 0
-    assert printed["golem"] > gains["golem"].high
-    assert "The Golem's earns more than the authors'" in text and reference["golem"] > 0
 
 
 def test_stored_results_belong_to_the_shipped_agents():

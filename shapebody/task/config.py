@@ -144,5 +144,5 @@ class TaskConfig:
         """Settings for evaluation: commands within +-1 for every design and an action delay of
         exactly one control step. The paper does not state them all; with these, the authors'
         published policies gain about what the paper reports for two of three robots (notebook
-        02)."""
+        03)."""
         return cls(**{"command_limit": 1.0, "action_delay": 1, **changes})

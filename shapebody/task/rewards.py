@@ -13,7 +13,7 @@ Where the table leaves something open, the terms are:
   command is zero;
 - T21, symmetric air: feet are paired by their mirrored y.
 
-With these, the authors' published policies earn about what the paper reports (notebook 02).
+With these, the authors' published policies earn about what the paper reports (notebook 03).
 """
 
 from collections.abc import Callable

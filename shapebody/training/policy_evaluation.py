@@ -39,7 +39,7 @@ def train_critic(
     The task is the one that designs are evaluated on (`TaskConfig.evaluation`): every action is
     late by one step, and the commands of small bodies are as fast as those of large ones. With
     the task of the policy's training (`task_of="training"`, the older way), a critic takes slow
-    commands for a merit of small bodies. Notebook 04 compares the two: at λ = 100 the newer way
+    commands for a merit of small bodies. Notebook 06 compares the two: at λ = 100 the newer way
     finds better bodies, at λ = 20 for the Go2 only.
 
     The agent's policy acts on designs f ~ U([-r, r]^d) with r ~ U(0, 1), with its mean actions as
