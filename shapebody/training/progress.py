@@ -11,7 +11,7 @@ from tqdm import tqdm
 
 from shapebody.files import atomic_write, curve_text, names_path
 from shapebody.stored import read_text
-from shapebody.task.env import Trajectory
+from shapebody.task.trajectory import Trajectory
 from shapebody.training.run_state import ANEW
 
 # ---------------------------------------------------------------------- the learning curve

@@ -13,7 +13,8 @@ import numpy as np
 
 from shapebody.arguments import require_flag, require_kind
 from shapebody.networks.policy import Policy, log_prob
-from shapebody.task.env import Locomotion, Trajectory
+from shapebody.task.env import Locomotion
+from shapebody.task.trajectory import Trajectory
 
 
 def make_policy_function(policy: Policy, mean_actions: bool = False):

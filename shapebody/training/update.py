@@ -16,7 +16,7 @@ import optax
 from shapebody.arguments import refuse, require_key, require_kind
 from shapebody.networks.critic import Critic
 from shapebody.networks.policy import Policy, log_prob
-from shapebody.task.env import Trajectory
+from shapebody.task.trajectory import Trajectory
 from shapebody.training import losses
 from shapebody.training.config import TrainConfig
 
