@@ -371,14 +371,9 @@ def test_stored_results_belong_to_the_shipped_agents():
     "name, episodes", [("unitree_go2", 100), ("mit_humanoid", 50), ("golem", 50)]
 )
 def test_stored_studies_are_whole(name, episodes):
-    """All methods and all λ, with today's settings; the paper has 200 episodes.
-
-    Bayesian optimization with the MIT Humanoid's critic is still to be computed (TRAINING.md).
-    """
+    """All methods and all λ, with today's settings; the paper has 200 episodes."""
     robot, agent = load_robot(name), load_agent(name)
     runs = (*reproduction_design_study.METHOD_RUNS, *reproduction_design_study.TRUST_REGION_RUNS)
-    if name == "mit_humanoid":
-        runs = tuple(run for run in runs if run.method != "bo")
     setting = dict(starts=10, episodes=episodes, horizon=1000)
     assert available(agent, robot, runs, **setting) == runs
     stored = reproduction_results.stored_parts(
