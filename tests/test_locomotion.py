@@ -410,7 +410,7 @@ def test_ranges_of_settings():
         TaskConfig(command_limit=0)
     with pytest.raises(ValueError, match="velocity_bound is 0; expected a positive number"):
         TaskConfig(velocity_bound=0)
-    with pytest.raises(ValueError, match="curriculum_success is 'length'; expected one of"):
+    with pytest.raises(ValueError, match="curriculum_success is 'length'; expected 'tracking' or"):
         TaskConfig(curriculum_success="length")
 
 

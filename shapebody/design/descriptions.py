@@ -25,10 +25,6 @@ from shapebody.design.phi import Embodiment
 from shapebody.robot.robot import Robot, require_robot
 from shapebody.rotations import constant_matrices, rotate, rotation_matrices
 
-JOINT_DESCRIPTION = 30
-
-FOOT_DESCRIPTION = 21
-
 MOST_PARTS = 10_000
 """Joints, feet or spheres of a robot."""
 
