@@ -49,7 +49,7 @@ from arguments import (
     thing,
 )
 
-from shapebody.task.env import Trajectory
+from shapebody.task.trajectory import Trajectory
 from shapebody.training.update import Learner
 
 INTERNAL = {

@@ -23,6 +23,8 @@ from shapebody.training import losses, policy_evaluation, progress, rollout, run
 from shapebody.training import trainer as training_trainer
 from shapebody.training.update import init_learner, ppo_update
 
+pytestmark = pytest.mark.usefixtures("quick")
+
 
 def test_advantages_against_a_plain_loop():
     rng = np.random.default_rng(0)
@@ -343,7 +345,7 @@ def test_a_run_continues_only_with_its_own_configuration(config, tmp_path):
             dict(policy=replace(config.policy, core_widths=(12, 8))),
             r"core_widths was \[16, 8\], is \[12, 8\]",
         ),
-        (dict(num_envs=32), "num_envs was 16, is 32.*continue_run, choose another name"),
+        (dict(num_envs=32), "num_envs was 16, is 32.*continue_run.*choose another name"),
     ):
         with pytest.raises(ValueError, match=message):
             training_trainer.Trainer(replace(config, **changes), tmp_path).start()
@@ -764,6 +766,6 @@ def test_training_on_mjx_resumes(tmp_path):
         trainer = begin(config, tmp_path / "stopped", "mjx" if steps == 32 else "auto")
         assert trainer.env.engine == "mjx"
         trainer.run(max_steps=steps, progress=False)
-    assert trainer.steps == 96 and np.any(np.asarray(trainer.state.design))
+    assert trainer.steps == 96 and np.any(np.asarray(trainer.actor.state.design))
     for a, b in zip(leaves(straight), leaves(trainer), strict=True):
         np.testing.assert_array_equal(a, b)

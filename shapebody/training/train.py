@@ -151,13 +151,14 @@ def _train(
 ) -> Agent | None:
     """`train`, with settings that may differ from those of the run in the folder."""
     max_steps, max_seconds = budget
+    folder = chosen_folder(folder, config.name)
     if max_steps is not None and max_steps < config.batch:
         raise ValueError(
             f"max_steps is {max_steps}; one iteration is {config.batch} steps: give at least as "
             "many, or a configuration with fewer environments"
         )
     # At once: the trainer, which looks again, takes a while to compile.
-    require_own_config(chosen_folder(folder, config.name), config, tuple(changeable))
+    require_own_config(folder, config, tuple(changeable))
     announce(engine, len(config.robots), progress)
     trainer = Trainer(config, folder, engine)
     # From reading the state to saving the agent: what another call has written meanwhile would be
