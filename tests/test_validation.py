@@ -1,6 +1,5 @@
 """Validation: reports say what load_robot would raise, and what looks wrong; the command line."""
 
-import time
 
 import numpy as np
 import pytest
@@ -27,9 +26,7 @@ def test_a_shipped_robot_is_fine():
 
 
 def test_report_of_a_completed_file(dog):
-    before = time.perf_counter()
     report = validate_robot(dog)
-    assert time.perf_counter() - before < 2
     assert report.ok and report.inferred == load_robot(dog).inferred
     text = str(report)
     assert repr(report) == text and max(map(len, text.splitlines())) < 200
