@@ -16,7 +16,6 @@ from pathlib import Path
 
 import nbformat
 from nbclient import NotebookClient
-from nbclient.exceptions import CellExecutionError
 from nbconvert.preprocessors import ClearMetadataPreprocessor
 
 from shapebody.files import atomic_write
@@ -113,7 +112,7 @@ def main(arguments=None) -> int:
                 print(path, flush=True)
                 execute(path)
             found = problems(path)
-        except (OSError, nbformat.reader.NotJSONError, CellExecutionError) as error:
+        except Exception as error:  # of a cell, of the kernel, of the file
             found = [f"failed and was left as it was:\n{error}"]
         print(*(f"{path}: {problem}" for problem in found), sep="\n", end="\n" if found else "")
         failed += bool(found)

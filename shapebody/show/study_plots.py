@@ -182,7 +182,6 @@ def agreement(ax, kinds, common, spread) -> None:
     ax.barh(place - 0.2, common, 0.4, label="common point")
     ax.barh(place + 0.2, spread, 0.4, label="spread")
     ax.set(yticks=place, yticklabels=kinds, xlabel="|f|, root mean square")
-    ax.invert_yaxis()
 
 
 def way(axes, searches) -> None:
