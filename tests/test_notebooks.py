@@ -3,6 +3,7 @@
 `make test` also runs every notebook at scale smoke, through nbmake.
 """
 
+import re
 from pathlib import Path
 
 import nbformat
@@ -16,6 +17,37 @@ SHIPPED = sorted((Path(__file__).resolve().parent.parent / "notebooks").glob("*.
 @pytest.mark.parametrize("path", SHIPPED, ids=lambda path: path.name)
 def test_shipped_notebook_is_executed_and_clean(path):
     assert notebooks.problems(path) == []
+
+
+def prose(path) -> list[str]:
+    cells = nbformat.read(path, as_version=4).cells
+    return [cell.source for cell in cells if cell.cell_type == "markdown"]
+
+
+HEADER = ["Shows", "Paper", "2 CPU cores", "GPU", "Before", "Next"]
+
+
+@pytest.mark.parametrize("path", SHIPPED, ids=lambda path: path.name)
+def test_headers_are_alike_and_lead_from_one_to_the_next(path):
+    first, place = prose(path)[0], SHIPPED.index(path)
+    assert first.startswith(f"# {path.name[:2]} · ")
+    rows = dict(re.findall(r"^\| ([^|]+) \| ([^|]+) \|$", first, re.MULTILINE))
+    assert list(rows) == HEADER
+    neighbours = {"Before": SHIPPED[place - 1 :][:1] if place else [], "Next": SHIPPED[place + 1 :]}
+    for row, others in neighbours.items():
+        names = re.findall(r"\]\(([^)]+)\)", rows[row])
+        assert names == [other.name for other in others[:1]], row
+
+
+@pytest.mark.parametrize("path", SHIPPED, ids=lambda path: path.name)
+def test_notebooks_end_alike_and_their_links_lead_somewhere(path):
+    text = "\n".join(prose(path))
+    ends = re.findall(r"^## (Takeaways|Exercises|References)$", text, re.MULTILINE)
+    assert ends == ["Takeaways", "Exercises", "References"]
+    assert "](https://" in text[text.index("## References") :]
+    inside = [link for link in re.findall(r"\]\(([^)]+)\)", text) if "://" not in link]
+    assert inside and all((path.parent / link).exists() for link in inside)
+    assert not re.search(r"\b[Nn]otebook \d", text), "refer by a link, not by a number alone"
 
 
 def write(path, *sources):
