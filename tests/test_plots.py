@@ -3,7 +3,7 @@ import numpy as np
 import pytest
 
 from shapebody import load_agent
-from shapebody.show import plots, tables
+from shapebody.show import diagrams, plots, study_plots, tables
 
 
 @pytest.fixture
@@ -119,3 +119,53 @@ def test_intervals_have_one_row_each():
     assert [point.get_ydata()[0] for point in points] == [0, 2]
     assert [point.get_color() for point in points] == ["red", "black"]
     plt.close(figure)
+
+
+def test_panels_have_a_title_each():
+    axes = plots.panels(["a", "b"])
+    assert [ax.get_title() for ax in axes] == ["a", "b"]
+    rows = plots.panels(["a", "b", "c"], columns=2)
+    assert [[ax.get_title() for ax in row] for row in rows] == [["a", ""], ["b", ""], ["c", ""]]
+    with pytest.raises(ValueError, match="titles is empty"):
+        plots.panels([])
+    plt.close("all")
+
+
+def test_one_legend_for_all_panels():
+    axes = plots.panels(["a", "b"])
+    axes[0].plot([0, 1], label="both")
+    for label in ("both", "second only"):
+        axes[1].plot([0, 1], label=label)
+    plots.legend_beside(axes)
+    assert axes[0].get_legend() is None
+    assert [t.get_text() for t in axes[1].get_legend().get_texts()] == ["both", "second only"]
+    plt.close("all")
+
+
+def test_folded_tables_open_with_a_click_and_print_at_once():
+    folded = tables.Folded("more < less", *(tables.table([(x, 1)], ("", "b")) for x in "xy"))
+    page = folded._repr_html_()
+    assert (
+        page.startswith("<details><summary>more &lt; less</summary>") and page.count("<table") == 2
+    )
+    assert "x  1" in repr(folded) and "y  1" in repr(folded)
+
+
+@pytest.mark.parametrize("name", ["pipeline", "urma", "critics", "actor_and_learner"])
+def test_diagrams_are_drawn_within_their_frame(name):
+    figure = getattr(diagrams, name)()
+    figure.canvas.draw()
+    for text in figure.axes[0].texts:
+        box = text.get_window_extent()
+        assert 0 <= box.x0 < box.x1 <= figure.bbox.width, text.get_text()
+    plt.close(figure)
+
+
+def test_a_ranking_shows_the_papers_value_where_ours_is_missing():
+    ax = plots.panels(["a"])[0]
+    rows = {m: dict(mean=x, low=x - 1, high=x + 1) for m, x in (("vgds", 2.0), ("cem", 1.0))}
+    study_plots.ranking(ax, rows, {"vgds": "VGDS", "cem": "CEM", "bo": "BO"}, {"bo": 5.0})
+    assert [label.get_text() for label in ax.get_yticklabels()] == ["BO", "CEM", "VGDS"]
+    diamonds = [line for line in ax.lines if line.get_marker() == "D"]
+    assert [(line.get_xdata()[0], line.get_ydata()[0]) for line in diamonds] == [(5.0, 0)]
+    plt.close("all")

@@ -1,6 +1,5 @@
 """Validation: reports say what load_robot would raise, and what looks wrong; the command line."""
 
-
 import numpy as np
 import pytest
 from test_inference import biped_urdf, quadruped
