@@ -32,7 +32,7 @@ METHOD_STYLES = {
 
 def lambda_axis(ax, lambdas, **labels) -> None:
     """Axis of λ with a tick per value, all equally far apart."""
-    ax.set_xticks(range(len(lambdas)), [f"{value:g}" for value in lambdas])
+    ax.set_xticks(range(len(lambdas)), [f"{value:g}" for value in lambdas], fontsize="x-small")
     ax.set(xlabel="λ", **labels)
 
 
