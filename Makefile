@@ -45,7 +45,7 @@ test: venv
 	@status=0; \
 	$(PY) -m pytest tests $(PYTEST_ARGS) || status=$$?; \
 	if [ -n "$(NOTEBOOKS)" ]; then \
-		SHAPEBODY_SCALE=smoke $(PY) -m pytest --nbmake --nbmake-timeout=900 $(NOTEBOOKS) \
+		SHAPEBODY_SCALE=smoke $(PY) -m pytest --nbmake --nbmake-timeout=900 -n 2 $(NOTEBOOKS) \
 			|| status=$$?; \
 	fi; \
 	exit $$status

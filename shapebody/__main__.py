@@ -13,11 +13,21 @@ _FLAG = "--xla_cpu_multi_thread_eigen=false"
 
 def main(arguments=None) -> int:
     """Run a command; returns its exit status. Errors are one line on stderr."""
+    words = list(sys.argv[1:] if arguments is None else arguments)
+    try:
+        status = _run(words)
+        sys.stdout.flush()
+        return status
+    except BrokenPipeError:  # whoever read the output, such as `head`, has gone
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 1
+
+
+def _run(words: list[str]) -> int:
     import tyro
 
     from shapebody.commands import COMMANDS
 
-    words = list(sys.argv[1:] if arguments is None else arguments)
     if not words or words[0] not in COMMANDS:
         asked = bool(words) and words[0] in ("-h", "--help")
         wrong = "" if asked or not words else f"shapebody: no command {words[0][:80]!r}\n"
@@ -30,6 +40,8 @@ def main(arguments=None) -> int:
         command, words = COMMANDS[name](words)
         prog = f"python -m shapebody {name}"
         return tyro.cli(command, prog=prog, args=words) or 0
+    except BrokenPipeError:
+        raise
     except (ValueError, OSError, ImportError) as error:
         print(f"shapebody: {error}", file=sys.stderr)
         return 1

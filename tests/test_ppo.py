@@ -11,7 +11,6 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 import pytest
-from tiny import quick_compilation
 
 from shapebody.agent.store import load_agent, load_curve, save_agent
 from shapebody.configuration import from_json, to_json
@@ -171,12 +170,6 @@ def test_configurations_of_wrong_kinds(name, value):
 def test_robots_may_be_paths():
     config = training_config.TrainConfig.reduced(Path("here") / "bolt.xml")
     assert config.robots == (str(Path("here") / "bolt.xml"),) and config.name == "bolt"
-
-
-@pytest.fixture(scope="module", autouse=True)
-def quick():
-    with quick_compilation():
-        yield
 
 
 @pytest.fixture(scope="module")

@@ -2,28 +2,13 @@
 
 import numpy as np
 import pytest
-import tiny
 
 from shapebody.evaluation.evaluate import EvaluationConfig, evaluate
 from shapebody.evaluation.recording import record_episode
 from shapebody.task.config import TaskConfig
 from shapebody.task.rewards import combine
 
-
-@pytest.fixture(scope="module", autouse=True)
-def quick():
-    with tiny.quick_compilation():
-        yield
-
-
-@pytest.fixture(scope="module")
-def robot(tmp_path_factory):
-    return tiny.tiny_robot(tmp_path_factory.mktemp("robots"))
-
-
-@pytest.fixture(scope="module")
-def agent(robot):
-    return tiny.tiny_agent(robot)
+pytestmark = pytest.mark.usefixtures("quick")
 
 
 @pytest.fixture(scope="module")

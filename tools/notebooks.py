@@ -22,12 +22,37 @@ from shapebody.files import atomic_write
 
 LONGEST_CELL = 30
 """Lines of code."""
+LONGEST_SILENCE = 10.0
+"""Seconds of a cell without output."""
 LARGEST_FILE = 1.5e6
 """Bytes."""
 METADATA = {
     "kernelspec": {"display_name": "Python 3 (ipykernel)", "language": "python", "name": "python3"},
     "language_info": {"name": "python"},
 }
+
+
+class Listener(NotebookClient):
+    """Executes a notebook and notes how long its cells say nothing: readers think they hang."""
+
+    def begin(self) -> None:
+        """A cell begins."""
+        self.began = self.heard = time.perf_counter()
+        self.silence = 0.0
+
+    def pause(self) -> tuple[float, float]:
+        """A cell has ended: its seconds, and the longest time without output."""
+        self._hear()
+        return self.heard - self.began, self.silence
+
+    def _hear(self) -> None:
+        now = time.perf_counter()
+        self.silence, self.heard = max(self.silence, now - self.heard), now
+
+    def process_message(self, msg, cell, cell_index):
+        if msg["msg_type"] in ("stream", "display_data", "update_display_data"):
+            self._hear()
+        return super().process_message(msg, cell, cell_index)
 
 
 def execute(path: Path, timeout: float | None = None) -> None:
@@ -37,14 +62,16 @@ def execute(path: Path, timeout: float | None = None) -> None:
     tagged "raises-exception" may raise. timeout: seconds for one cell.
     """
     notebook = nbformat.read(path, as_version=4)
-    number, began = 0, time.perf_counter()
+    total, number = len(code_cells(notebook)), 0
 
     def done(cell, **_):
-        nonlocal number, began
-        number, seconds, began = number + 1, time.perf_counter() - began, time.perf_counter()
-        print(f"  cell {number} of {len(code_cells(notebook))}: {seconds:.1f} s", flush=True)
+        nonlocal number
+        number += 1
+        seconds, silence = client.pause()
+        note = f", of which {silence:.0f} s without a word" if silence > LONGEST_SILENCE else ""
+        print(f"  cell {number} of {total}: {seconds:.1f} s{note}", flush=True)
 
-    NotebookClient(
+    client = Listener(
         notebook,
         timeout=timeout,
         kernel_name="python3",
@@ -52,8 +79,10 @@ def execute(path: Path, timeout: float | None = None) -> None:
         coalesce_streams=True,  # also keeps only the last state of a progress bar
         store_widget_state=False,
         resources={"metadata": {"path": str(path.parent)}},
+        on_cell_execute=lambda **_: client.begin(),
         on_cell_executed=done,
-    ).execute()
+    )
+    client.execute()
     atomic_write(path, nbformat.writes(clean(notebook)) + "\n")
 
 
