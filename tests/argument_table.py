@@ -94,6 +94,7 @@ INTERNAL = {
     "task.randomization": "formulas inside compiled code, called by `task.env`",
     "task.sensors": "formulas inside compiled code, called by `task.env`",
     "task.trajectory": "what `task.env` returns",
+    "task.whole_episodes": "plays what `evaluate` and `yardstick` have looked at",
 }
 
 RESULT = "a result: the package makes it, no user does"
@@ -140,6 +141,7 @@ UNCHECKED = {
     "networks.urma.elu": FORMULA,
     "networks.policy.entropy": FORMULA,
     "networks.policy.log_prob": FORMULA,
+    "networks.policy.mean_action_policy": "called with the configuration of an agent",
     "networks.inputs.require_inputs": "a check itself, called by `Agent.act` and `Agent.values`",
     "physics.protocol.EngineOutput": RESULT,
     "physics.engine.simulator": "called by `Locomotion`, which has looked at the engine's name",
@@ -192,6 +194,7 @@ UNCHECKED |= {
     "training.train.run_or_interrupt": "takes a `Trainer`, which looks at the rest",
     "training.trainer.Trainer.alone": "takes nothing",
     "training.update.Batch": RESULT,
+    "training.yardstick.Measured": RESULT,
     "training.update.require_variables": "a check itself, called by `init_learner`",
 }
 UNCHECKED |= dict.fromkeys(
@@ -209,7 +212,7 @@ UNCHECKED |= dict.fromkeys(
         f"training.update.{name}"
         for name in (
             "apply_at_steps constants critic_loss descend gradient_step gradient_steps "
-            "learning_rate minibatch_rows optimizer policy_loss prepare"
+            "learned_policy learning_rate minibatch_rows optimizer policy_loss prepare"
         ).split()
     ),
     FORMULA,
@@ -760,11 +763,14 @@ FUNCTIONS = {
         clip_range=POSITIVE,
         entropy_coefficient=AT_LEAST_0,
         max_gradient_norm=POSITIVE,
+        average_half_life=optional(POSITIVE),
+        average_proximal=FLAG,
         kl_threshold=POSITIVE.also("inf", why="no threshold"),
         task=TASK,
         learn_policy=FLAG,
         mean_actions=FLAG,
         state_bank=integer(1, 2**24),
+        yardstick_interval=optional(integer(1, 10**15)),
     ),
     "training.config.TrainConfig.at_scale": dict(scale=choice("smoke"), robot=ROBOT_NAME),
     "training.config.TrainConfig.full": dict(robot=ROBOT_NAME),
@@ -831,6 +837,14 @@ FUNCTIONS = {
         state_only=FLAG,
         replace=FLAG,
         **RESUMED,
+    ),
+    "training.yardstick.yardstick": dict(
+        config=config("networks.config", "PolicyConfig"),
+        policy=thing(lambda world: world.agent.policy),
+        robots=ROBOT,
+        coefficient=PROBABILITY,
+        bodies=integer(1, 2**20),
+        engine=ENGINE,
     ),
     "training.policy_evaluation.train_critic": dict(
         agent=AGENT,

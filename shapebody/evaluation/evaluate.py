@@ -6,7 +6,6 @@ import dataclasses
 import functools
 import time
 from dataclasses import dataclass, field
-from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -27,17 +26,13 @@ from shapebody.evaluation.statistics import (
     bootstrap_interval,
     float_or_array,
 )
-from shapebody.networks.config import PolicyConfig
-from shapebody.networks.policy import Policy
+from shapebody.networks.policy import mean_action_policy
 from shapebody.robot.robot import Robot
-from shapebody.task.batch import RESET_SLOTS
 from shapebody.task.config import TaskConfig
 from shapebody.task.env import Locomotion
+from shapebody.task.whole_episodes import EpisodeResults, Episodes, play
 
-_CALLS = 50
-"""Control steps between two reports, and per call of an engine that runs whole rollouts."""
-
-Episodes = integer(1, MOST_EPISODES)
+EpisodeCount = integer(1, MOST_EPISODES)
 Coefficient = number("a number from 0 to 1", ge=0, le=1)
 
 
@@ -45,13 +40,13 @@ Coefficient = number("a number from 0 to 1", ge=0, le=1)
 class EvaluationConfig:
     """How designs are evaluated: 200 episodes as in the paper, with `TaskConfig.evaluation`."""
 
-    episodes: Episodes = 200
+    episodes: EpisodeCount = 200
     """Episodes per design."""
     coefficient: Coefficient = 1.0
     """Curriculum coefficient c of all episodes, in [0, 1]."""
     task: TaskConfig = field(default_factory=TaskConfig.evaluation)
     """Settings of the task."""
-    num_envs: Episodes = 512
+    num_envs: EpisodeCount = 512
     """Largest number of episodes that run side by side."""
 
 
@@ -171,17 +166,18 @@ def evaluate(
     chunks = -(-total // config.num_envs)
     size = -(-total // chunks)
     env = _environment(robot, size, engine, config.task)
-    keys = np.asarray(_episode_keys(seed, config.episodes))
-    work = _Work(rows, keys, config, progress)
 
     # All episodes of all designs, and their results as [S, E].
+    keys = np.asarray(_episode_keys(seed, config.episodes))
+    work = Episodes(rows, keys, config.coefficient, report=_print_share if progress else _silent)
+    act, embed = mean_action_policy(agent.policy_config)
     began = time.perf_counter()
-    results = _queued(env, agent, work) if env.engine == "native" else _chunked(env, agent, work)
+    results = play(env, act, functools.partial(embed, agent.policy), work)
     if progress:
         print(flush=True)
     seconds = time.perf_counter() - began
     shape = designs.shape[:-1] + (config.episodes,)
-    results = _Episodes(*(x.reshape(shape) for x in results))
+    results = EpisodeResults(*(x.reshape(shape) for x in results))
     return Evaluation(
         **results._asdict(),
         seconds=seconds,
@@ -196,155 +192,12 @@ def evaluate(
     )
 
 
-class _Episodes(NamedTuple):
-    """One entry per episode."""
-
-    returns: np.ndarray
-    tracking_error: np.ndarray
-    lengths: np.ndarray
-    finite: np.ndarray
+def _print_share(share: float) -> None:
+    print(f"\revaluated {share:4.0%}", end="", flush=True)
 
 
-@dataclass(frozen=True)
-class _Work:
-    """All episodes of an evaluation; number n is episode n % E of design n // E."""
-
-    designs: np.ndarray  # [S, d]
-    keys: np.ndarray  # [E, ...]
-    config: EvaluationConfig
-    progress: bool
-
-    @property
-    def total(self) -> int:
-        return len(self.designs) * len(self.keys)
-
-    def begin(self, env: Locomotion, numbers):
-        """Start these episodes in all environments."""
-        designs, keys = self.of(numbers)
-        key = jax.random.PRNGKey(0)  # the episodes have their own
-        return env.reset(key, designs, self.config.coefficient, keys=jnp.asarray(keys))
-
-    def of(self, numbers):
-        """Designs [n, d] and keys [n, ...] of episodes."""
-        design, episode = np.divmod(numbers, len(self.keys))
-        return self.designs[design], self.keys[episode]
-
-    def empty(self) -> _Episodes:
-        return _Episodes(
-            returns=np.zeros(self.total, np.float32),
-            tracking_error=np.zeros(self.total, np.float32),
-            lengths=np.zeros(self.total, np.int32),
-            finite=np.ones(self.total, bool),
-        )
-
-    def report(self, done: float):
-        if self.progress:
-            print(f"\revaluated {done / self.total:4.0%}", end="", flush=True)
-
-
-def _queued(env: Locomotion, agent: Agent, work: _Work) -> _Episodes:
-    """Native engine: an environment whose episode has ended takes the next one."""
-    # The first episodes, one in every environment.
-    policy, embed = _policy(agent.policy_config), _embed(agent.policy_config)
-    results = work.empty()
-    number = np.arange(env.num_envs)  # the episode in each environment
-    following = env.num_envs
-    state = work.begin(env, number)
-    params = embed(agent.policy, state.descriptions)
-    key = jax.random.PRNGKey(0)  # mean actions need no random numbers
-    running = np.ones(env.num_envs, bool)
-    step = 0
-    while running.any():
-        # One control step, and the results of the episodes that it ended.
-        state, record, _ = env.step(policy, params, state, key, running)
-        ended = running & (record.terminated | record.truncated)
-        _store(results, number[ended], record, ended)
-        running &= ~ended
-        left = work.total - following
-        idle = np.flatnonzero(~running)[:left]
-        # The next episodes. Their start is compiled for several at once, so some wait for others.
-        if left and len(idle) >= min(RESET_SLOTS, left, env.num_envs):
-            number[idle] = np.arange(following, following + len(idle))
-            following += len(idle)
-            designs, keys = work.of(number[idle])
-            state = env.restart(state, idle, keys, designs, work.config.coefficient)
-            params = embed(agent.policy, state.descriptions)
-            running[idle] = True
-        step += 1
-        if step % _CALLS == 0 or not running.any():
-            # An episode under way counts by the share of the horizon that is behind it.
-            part = np.sum(record.episode_length[running]) / env.config.horizon
-            work.report(following - running.sum() + part)
-    return results
-
-
-def _chunked(env: Locomotion, agent: Agent, work: _Work) -> _Episodes:
-    """MJX: one episode in every environment, until all have ended; then the next ones."""
-    policy, embed = _policy(agent.policy_config), _embed(agent.policy_config)
-    results = work.empty()
-    key = jax.random.PRNGKey(0)
-    length = min(_CALLS, env.config.horizon)
-    for first in range(0, work.total, env.num_envs):
-        # The last chunk is filled up with its own last episode.
-        number = np.minimum(np.arange(first, first + env.num_envs), work.total - 1)
-        state = work.begin(env, number)
-        params = embed(agent.policy, state.descriptions)
-        running = np.ones(env.num_envs, bool)
-        step = 0
-        while running.any():
-            state, trajectory = env.rollout(policy, params, state, key, length)
-            for record in _rows(trajectory, length):
-                ended = running & (record.terminated | record.truncated)
-                _store(results, number[ended], record, ended)
-                running &= ~ended
-            step += length
-            share = step / env.config.horizon if running.any() else 1.0
-            work.report(min(first + share * env.num_envs, work.total))
-    return results
-
-
-def _store(results: _Episodes, numbers, record, ended) -> None:
-    results.returns[numbers] = record.episode_return[ended]
-    results.tracking_error[numbers] = record.episode_error[ended]
-    results.lengths[numbers] = record.episode_length[ended]
-    results.finite[numbers] = record.finite[ended]
-
-
-class _Row(NamedTuple):
-    terminated: np.ndarray
-    truncated: np.ndarray
-    finite: np.ndarray
-    episode_return: np.ndarray
-    episode_error: np.ndarray
-    episode_length: np.ndarray
-
-
-def _rows(trajectory, length: int):
-    columns = [np.asarray(getattr(trajectory, name)) for name in _Row._fields]
-    return [_Row(*(column[t] for column in columns)) for t in range(length)]
-
-
-@functools.lru_cache
-def _policy(config: PolicyConfig):
-    """Mean actions for `Locomotion`; params are the variables and the embedded descriptions."""
-    module = Policy(config)
-
-    def act(params, key, descriptions, observation):
-        variables, embedding = params
-        mean, _ = module.apply(variables, embedding, descriptions, observation, method="act")
-        return mean, ()
-
-    return act
-
-
-@functools.lru_cache
-def _embed(config: PolicyConfig):
-    module = Policy(config)
-
-    def embed(variables, descriptions):
-        return variables, module.apply(variables, descriptions, method="embed")
-
-    return jax.jit(embed)
+def _silent(share: float) -> None:
+    pass
 
 
 @functools.lru_cache(maxsize=4)

@@ -17,8 +17,7 @@ from shapebody.agent.agent import Agent, require_agent
 from shapebody.arguments import require_array, require_kind, require_number, require_seed
 from shapebody.design.descriptions import Descriptions
 from shapebody.design.space import DesignSpace
-from shapebody.networks.config import PolicyConfig
-from shapebody.networks.policy import Policy
+from shapebody.networks.policy import mean_action_policy
 from shapebody.robot.robot import Robot
 from shapebody.task import randomization
 from shapebody.task.config import CONTROL_STEP, TaskConfig
@@ -120,7 +119,8 @@ def record_episode(
     state = env.reset(key, design, coefficient=coefficient, keys=key[None])
     if command is not None:
         state = _with_command(state, command)
-    policy = _mean_action(agent.policy_config)
+    policy, embed = mean_action_policy(agent.policy_config)
+    params = embed(agent.policy, state.descriptions)
     physics = env.groups[0].physics
     descriptions = jax.tree.map(lambda x: np.asarray(x)[0], state.descriptions)
 
@@ -128,7 +128,7 @@ def record_episode(
     rows, ended = [], "horizon"
     for _ in range(min(round(seconds / CONTROL_STEP), task.horizon)):
         qpos, before = physics.qpos[0].copy(), np.asarray(state.command)[0]
-        state, record, outcome = env.step(policy, agent.policy, state, key)
+        state, record, outcome = env.step(policy, params, state, key)
         if not record.finite[0]:
             ended = "not finite"
             break
@@ -163,13 +163,3 @@ def _with_command(state, command):
 def _environment(robot: Robot, task: TaskConfig) -> Locomotion:
     # One simulation needs no second thread.
     return Locomotion(robot, 1, "native", task, auto_reset=False, threads=1)
-
-
-@functools.lru_cache
-def _mean_action(config: PolicyConfig):
-    module = Policy(config)
-
-    def act(variables, key, descriptions, observation):
-        return module.apply(variables, descriptions, observation)[0], ()
-
-    return act

@@ -4,8 +4,10 @@ The mean of joint j's action is the dot product of its key with the output of th
 which sees the latent of all joints, the general observations and what is static of the design.
 """
 
+import functools
 from typing import Any
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from flax import linen as nn
@@ -102,3 +104,24 @@ def entropy(std, mask):
     """Differential entropy in nats of the action Gaussians, summed over the real joints."""
     per_joint = jnp.log(std) + 0.5 * float(np.log(2 * np.pi * np.e))
     return jnp.sum(per_joint * mask, axis=-1)
+
+
+@functools.lru_cache
+def mean_action_policy(config: PolicyConfig):
+    """(act, embed) of a policy without exploration noise, for rollouts of frozen policies.
+
+    act: as `Locomotion` wants it; its parameters are what embed(variables, descriptions [N]) gives,
+    so that a body is encoded once instead of in every step. One configuration has one pair, which
+    belongs to one compilation.
+    """
+    module = Policy(config)
+
+    def act(params, key, descriptions, observation):
+        variables, embedding = params
+        mean, _ = module.apply(variables, embedding, descriptions, observation, method="act")
+        return mean, ()
+
+    def embed(variables, descriptions):
+        return variables, module.apply(variables, descriptions, method="embed")
+
+    return act, jax.jit(embed)

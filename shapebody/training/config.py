@@ -102,6 +102,13 @@ class TrainConfig:
     """Weight of the policy's entropy in its loss."""
     max_gradient_norm: Positive = 3.0
     """Gradients with a larger norm are scaled down to it."""
+    average_half_life: Positive | None = None
+    """Half-life, in environment steps, of the running average of the policy's weights that a saved
+    agent has for its policy; None: no average. Gradient steps of a large learning rate walk at
+    random around a better policy, and an average takes that walk out."""
+    average_proximal: Flag = False
+    """Whether the trust region lies around that average (PPO-EWMA, Hilton et al., 2022) instead of
+    the policy at the start of the iteration."""
     kl_threshold: Threshold = 0.5
     """The rest of an iteration's updates is skipped once a minibatch exceeds this; inf: never."""
 
@@ -113,6 +120,9 @@ class TrainConfig:
     """Act without exploration noise, as in evaluation; only if the policy does not learn."""
     state_bank: Size = 2048
     """States kept for design search."""
+    yardstick_interval: integer(1, MOST_STEPS) | None = 2_000_000
+    """Environment steps between two measurements of the policy on fixed random bodies
+    (`training.yardstick`), for the learning curve; None: never."""
 
     def __post_init__(self):
         names = [robot_name(robot) for robot in self.robots]
@@ -126,6 +136,11 @@ class TrainConfig:
             raise ValueError(
                 "mean_actions is True, but a policy learns from its exploration; expected "
                 "learn_policy=False with it"
+            )
+        if self.average_proximal and self.average_half_life is None:
+            raise ValueError(
+                "average_proximal is True, but there is no average; expected average_half_life in "
+                "environment steps with it, such as 1e6"
             )
         batch = self.num_envs * self.rollout_length
         if self.minibatch_size % self.rollout_length or self.minibatch_size > batch:
@@ -193,6 +208,7 @@ class TrainConfig:
             "epochs": 2,
             "total_steps": 512,
             "state_bank": 64,
+            "yardstick_interval": None,
         }
         return cls.reduced(robot, **{**tiny, **changes})
 

@@ -40,7 +40,7 @@ def train_critic(
     late by one step, and the commands of small bodies are as fast as those of large ones. With
     the task of the policy's training (`task_of="training"`, the older way), a critic takes slow
     commands for a merit of small bodies. Notebook 06 compares the two: at λ = 100 the newer way
-    finds better bodies, at λ = 20 for the Go2 only.
+    finds better bodies for all three robots, at λ = 20 worse ones for the MIT Humanoid.
 
     The agent's policy acts on designs f ~ U([-r, r]^d) with r ~ U(0, 1), with its mean actions as
     in evaluation: with exploration noise, the critic learns which bodies bear that noise, too. It
@@ -142,6 +142,9 @@ def evaluation_config(
         "critic": critic,
         "standardize": True,
         "learn_policy": False,
+        "yardstick_interval": None,
+        "average_half_life": None,
+        "average_proximal": False,
         "mean_actions": True,
         "epochs": 1,
         "discount": trained.discount,

@@ -18,12 +18,14 @@ from shapebody.training.run_state import ANEW
 
 CURVE = (
     "steps seconds return length tracking_error coefficient reward non_finite kl clipped std "
-    "value_loss explained_variance learning_rate steps_per_second"
+    "value_loss explained_variance learning_rate steps_per_second "
+    "success_c1 return_c1 success_half return_half"
 ).split()
 """Columns of the learning curve. return, length, tracking_error (m/s): means over the episodes that
 ended since the last row; coefficient and reward: means over steps; non_finite: episodes that
 were ended because the simulation became invalid; steps_per_second: without the first iteration of
-a call, which compiles."""
+a call, which compiles; success and return, at c = 1 and c = 0.5: on the bodies of the yardstick,
+where it was measured."""
 
 CURVE_INTERVAL = 10
 """Iterations per row of the learning curve."""
@@ -139,14 +141,16 @@ class Curve:
             row["steps_per_second"] = self.steps / max(self.seconds, 1e-9)
         return row
 
-    def write(self, steps: int, seconds: float) -> None:
+    def write(self, steps: int, seconds: float, measured: dict[str, float] | None = None) -> None:
         """Append the averages since the last row, if there are any.
 
-        steps, seconds: of the whole run so far.
+        steps, seconds: of the whole run so far; measured: columns of the yardstick.
         """
         if not self.count:
             return
-        row = {name: f"{value:.5g}" for name, value in self._row().items()}
+        self.latest |= measured or {}
+        row = self._row() | (measured or {})
+        row = {name: f"{value:.5g}" for name, value in row.items()}
         row |= {"steps": str(steps), "seconds": str(round(seconds, 1))}
         line = ",".join(row.get(name, "") for name in CURVE)
         with names_path(self.path), self.path.open("a", newline="") as file:
@@ -215,6 +219,8 @@ class Progress:
                 f"xy error {row['tracking_error']:.3f} m/s"
             )
         text += f"  c {row['coefficient']:.2f}"
+        if "success_c1" in row:
+            text += f"  walks {row['success_c1']:.0%} of all bodies"
         done, now = steps - self.first[0], time.monotonic()
         if done:
             rate = done / max(now - self.first[1], 1e-9)

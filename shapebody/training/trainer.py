@@ -39,12 +39,19 @@ from shapebody.training.run_state import (
     STATE,
     continued_phases,
     finished_iterations,
+    read_config,
     require_budget,
     require_run,
     run_engine,
     state_version,
 )
-from shapebody.training.update import init_learner, ppo_update, require_variables
+from shapebody.training.update import (
+    init_learner,
+    learned_policy,
+    ppo_update,
+    require_variables,
+)
+from shapebody.training.yardstick import BODIES, yardstick
 
 
 class Trainer:
@@ -129,6 +136,12 @@ class Trainer:
             "seconds": np.float64(self.seconds),
         }
 
+    def _as_saved(self) -> dict:
+        """`everything` with the structure that the file in the folder has."""
+        averages = read_config(self.folder).average_half_life is not None
+        average = self.learner.policy["params"] if averages else None
+        return {**self.everything(), "learner": replace(self.learner, average=average)}
+
     @contextlib.contextmanager
     def alone(self):
         """Keep other trainers out of the folder while the block runs; blocks may be nested.
@@ -205,8 +218,13 @@ class Trainer:
             first = {"from_step": 0, "config": to_json(self.config)}
             self.phases = [first | {"robots": robots, "engine": self.env.engine}]
             return False
-        saved = load_arrays(self.folder / STATE, self.everything())
+        saved = load_arrays(self.folder / STATE, self._as_saved())
         self.learner, self.seconds = saved["learner"], float(saved["seconds"])
+        # An average that is new begins with the policy; one that is no longer wanted goes.
+        averages = self.config.average_half_life is not None
+        if averages != (self.learner.average is not None):
+            average = self.learner.policy["params"] if averages else None
+            self.learner = replace(self.learner, average=average)
         self.actor.resume(saved["behaviour"], saved["state"], saved["physics"])
         return True
 
@@ -229,7 +247,7 @@ class Trainer:
             sizes=self.env.sizes,
             policy_config=config.policy,
             critic_config=config.critic,
-            policy=self.learner.policy,
+            policy=learned_policy(self.learner),
             critic=self.learner.critic,
             states=None if states is None else states[0],
             state_robots=None if states is None else states[1],
@@ -261,7 +279,7 @@ class Trainer:
         return collect_states(
             self.env,
             self.actor.act,
-            self.learner.policy,
+            learned_policy(self.learner),
             self.key,
             length=config.rollout_length,
             count=config.state_bank,
@@ -298,6 +316,7 @@ class Trainer:
         if number >= last:
             return
         batch, failures = self.config.batch, Failures(self.env)
+        per_row = curve_interval or CURVE_INTERVAL
         with self.alone(), self.actor as actor:
             self._require_latest()
             curve = Curve(self.folder / CURVE, self.steps)
@@ -312,8 +331,12 @@ class Trainer:
                     self.seconds, elapsed, mark = self.seconds + now - mark, now - mark, now
                     failures.add(trajectory)
                     curve.add(trajectory, metrics, batch, None if compiling else elapsed)
-                    if number % (curve_interval or CURVE_INTERVAL) == 0:
-                        curve.write(self.steps, self.seconds)
+                    if number % per_row == 0:
+                        measured = self._measured(per_row * batch)
+                        # The yardstick takes time, but does not slow down the training itself.
+                        mark = time.monotonic()
+                        self.seconds += mark - now
+                        curve.write(self.steps, self.seconds, measured)
                     report.show(self.steps, curve)
                     self.save()
                     if number >= last or now >= until:
@@ -334,6 +357,30 @@ class Trainer:
             actor.begin(self.learner.policy, number + 1)
         actor.wait()
         return metrics
+
+    def _measured(self, since: int) -> dict[str, float]:
+        """Columns of the yardstick, if it is due: once in `yardstick_interval` steps.
+
+        since: steps since it could have been measured last.
+        """
+        interval = self.config.yardstick_interval
+        if interval is None or self.steps // interval == (self.steps - since) // interval:
+            return {}
+        columns = {}
+        for name, coefficient in (("c1", 1.0), ("half", 0.5)):
+            measured = yardstick(
+                self.config.policy,
+                learned_policy(self.learner),
+                list(self.env.robots),
+                coefficient,
+                max(BODIES, len(self.env.robots)),
+                self.env.engine,
+            )
+            columns |= {
+                f"success_{name}": float(np.mean(measured.success)),
+                f"return_{name}": float(np.mean(measured.returns)),
+            }
+        return columns
 
 
 def _check_state_bank(config: TrainConfig, sizes) -> None:

@@ -31,6 +31,7 @@ class Learner:
     policy_optimizer: Any
     critic_optimizer: Any
     iteration: jax.Array  # [] int32, finished iterations
+    average: Any = None  # running average of the policy's parameters, if the run has one
 
 
 @jax.tree_util.register_dataclass
@@ -65,7 +66,15 @@ def init_learner(config: TrainConfig, policy, critic) -> Learner:
         policy_optimizer=optimizer(config).init(policy["params"]),
         critic_optimizer=optimizer(config).init(critic["params"]),
         iteration=jnp.zeros((), jnp.int32),
+        average=None if config.average_half_life is None else policy["params"],
     )
+
+
+def learned_policy(learner: Learner):
+    """Variables of the policy that a run has come to: of its running average, if it has one."""
+    if learner.average is None:
+        return learner.policy
+    return {**learner.policy, "params": learner.average}
 
 
 def require_variables(name: str, value):
@@ -104,6 +113,10 @@ def _ppo_update(config, learner, trajectory, key):
     rows = minibatch_rows(config, key)
     learner, of_steps = gradient_steps(config, learner, batch, rows, rate)
     metrics = {**of_steps, "learning_rate": rate, **metrics}
+    if config.average_half_life is not None:
+        keep = 0.5 ** (config.batch / config.average_half_life)
+        average = optax.incremental_update(learner.policy["params"], learner.average, 1 - keep)
+        learner = replace(learner, average=average)
     return replace(learner, iteration=learner.iteration + 1), metrics
 
 
@@ -147,7 +160,8 @@ def prepare(config: TrainConfig, learner: Learner, trajectory: Trajectory):
         advantage=losses.normalized(advantage, valid),
     )
     if config.learn_policy:
-        mean, std = apply_at_steps(policy, learner.policy, descriptions, slot, observation)
+        center = learned_policy(learner) if config.average_proximal else learner.policy
+        mean, std = apply_at_steps(policy, center, descriptions, slot, observation)
         proximal = log_prob(mean, std, batch.action, descriptions.joint_mask[:, :1])
         importance = losses.importance_weight(proximal, by_env(trajectory.extra))
         batch = replace(batch, proximal=proximal, importance=importance)
