@@ -25,7 +25,7 @@ CURVE = (
 ended since the last row; coefficient and reward: means over steps; non_finite: episodes that
 were ended because the simulation became invalid; steps_per_second: without the first iteration of
 a call, which compiles; success and return, at c = 1 and c = 0.5: on the bodies of the yardstick,
-where it was measured."""
+where it was measured (`training.yardstick`)."""
 
 CURVE_INTERVAL = 10
 """Iterations per row of the learning curve."""

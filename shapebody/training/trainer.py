@@ -51,7 +51,7 @@ from shapebody.training.update import (
     ppo_update,
     require_variables,
 )
-from shapebody.training.yardstick import BODIES, yardstick
+from shapebody.training.yardstick import CURVE_BODIES, yardstick
 
 
 class Trainer:
@@ -373,7 +373,7 @@ class Trainer:
                 learned_policy(self.learner),
                 list(self.env.robots),
                 coefficient,
-                max(BODIES, len(self.env.robots)),
+                max(CURVE_BODIES, len(self.env.robots)),
                 self.env.engine,
             )
             columns |= {

@@ -31,6 +31,9 @@ from shapebody.training.update import require_variables
 
 BODIES = 256
 """Number of bodies of the yardstick."""
+CURVE_BODIES = 128
+"""How many of them are measured for the learning curve: every 2 million steps, that takes about a
+twentieth of the training's time."""
 
 _SEED = 256  # of bodies and episodes; no start design and no evaluation has it
 
