@@ -130,10 +130,12 @@ def prepare(config: TrainConfig, learner: Learner, trajectory: Trajectory):
         return jax.tree.map(lambda x: jnp.swapaxes(x, 0, 1), tree)
 
     policy, critic = Policy(config.policy), Critic(config.critic)
+    chunks = number_of_chunks(config.num_envs, config.rollout_length)
     observation, descriptions = by_env(trajectory.observation), by_env(trajectory.descriptions)
     slot, valid = by_env(trajectory.slot), by_env(trajectory.valid)
     reward = by_env(trajectory.reward)
-    heads = apply_at_steps(critic, learner.critic, descriptions, slot, observation)
+    inputs = descriptions, slot, observation
+    heads = mapped(lambda x: apply_at_steps(critic, learner.critic, *x), inputs, chunks)
     value = jnp.mean(heads, -1)
     latest = jax.tree.map(lambda x: x[:, 1], descriptions)
     last_value = jnp.mean(critic.apply(learner.critic, latest, trajectory.last_observation), -1)
@@ -161,7 +163,7 @@ def prepare(config: TrainConfig, learner: Learner, trajectory: Trajectory):
     )
     if config.learn_policy:
         center = learned_policy(learner) if config.average_proximal else learner.policy
-        mean, std = apply_at_steps(policy, center, descriptions, slot, observation)
+        mean, std = mapped(lambda x: apply_at_steps(policy, center, *x), inputs, chunks)
         proximal = log_prob(mean, std, batch.action, descriptions.joint_mask[:, :1])
         importance = losses.importance_weight(proximal, by_env(trajectory.extra))
         batch = replace(batch, proximal=proximal, importance=importance)
@@ -193,6 +195,45 @@ def apply_at_steps(network, variables, descriptions, slot, observation):
     return network.apply(
         variables, jax.tree.map(spread, embedding), masks, observation, method="act"
     )
+
+
+CHUNK = 1024
+"""Control steps whose networks are computed at a time on a CPU: their arrays fit its cache, which
+nearly halves the time of a gradient."""
+
+
+def number_of_chunks(environments: int, length: int) -> int:
+    """In how many equal parts environments of `length` steps are computed, one after the other."""
+    if jax.default_backend() != "cpu":
+        return 1
+    most = min(environments, max(1, environments * length // CHUNK))
+    return next(n for n in range(most, 0, -1) if environments % n == 0)
+
+
+def _chunked(tree, chunks: int):
+    return jax.tree.map(lambda x: x.reshape((chunks, -1) + x.shape[1:]), tree)
+
+
+def mapped(function, tree, chunks: int):
+    """function(tree) of arrays [N, ...], computed in chunks of environments."""
+    if chunks == 1:
+        return function(tree)
+    result = jax.lax.map(function, _chunked(tree, chunks))
+    return jax.tree.map(lambda x: x.reshape((-1,) + x.shape[2:]), result)
+
+
+def summed(function, tree, chunks: int):
+    """Sum of function(chunk) over chunks of environments of arrays [N, ...]."""
+    if chunks == 1:
+        return function(tree)
+    parts = _chunked(tree, chunks)
+    shapes = jax.eval_shape(function, jax.tree.map(lambda x: x[0], parts))
+    zeros = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shapes)
+
+    def add(total, part):
+        return jax.tree.map(jnp.add, total, function(part)), None
+
+    return jax.lax.scan(add, zeros, parts)[0]
 
 
 def minibatch_rows(config: TrainConfig, key):
@@ -250,15 +291,25 @@ def gradient_steps(config: TrainConfig, learner: Learner, batch: Batch, rows, ra
 
 def gradient_step(config: TrainConfig, learner: Learner, batch: Batch, rate, stopped):
     """One step of critic and policy on a minibatch: (Learner, whether to stop, metrics)."""
-    loss, gradient = jax.value_and_grad(partial(critic_loss, config))(
-        learner.critic["params"], constants(learner.critic), batch
+    chunks = number_of_chunks(*batch.valid.shape)
+    both = batch, losses.step_weights(batch.valid)
+    loss, gradient = summed(
+        lambda x: jax.value_and_grad(partial(critic_loss, config))(
+            learner.critic["params"], constants(learner.critic), *x
+        ),
+        both,
+        chunks,
     )
     critic, state = descend(config, learner.critic, learner.critic_optimizer, gradient, rate)
     metrics = {"value_loss": loss, "updates": jnp.ones(())}
     policy, policy_state = learner.policy, learner.policy_optimizer
     if config.learn_policy:
-        (_, more), gradient = jax.value_and_grad(partial(policy_loss, config), has_aux=True)(
-            policy["params"], constants(policy), batch
+        (_, more), gradient = summed(
+            lambda x: jax.value_and_grad(partial(policy_loss, config), has_aux=True)(
+                policy["params"], constants(policy), *x
+            ),
+            both,
+            chunks,
         )
         policy, policy_state = descend(config, policy, policy_state, gradient, rate)
         metrics |= more
@@ -274,35 +325,34 @@ def gradient_step(config: TrainConfig, learner: Learner, batch: Batch, rate, sto
     return learner, stopped, metrics
 
 
-def policy_loss(config: TrainConfig, params, constants, batch: Batch):
-    """(surrogate loss minus entropy bonus, metrics) of the policy's parameters on a minibatch."""
+def policy_loss(config: TrainConfig, params, constants, batch: Batch, weight):
+    """(surrogate loss minus entropy bonus, metrics) of the policy's parameters on steps whose
+    weights [N, T] are `weight`; sums, so that those of the chunks of a minibatch can be added."""
     variables = {"params": params, **constants}
     mean, std = apply_at_steps(
         Policy(config.policy), variables, batch.descriptions, batch.slot, batch.observation
     )
     mask = batch.descriptions.joint_mask[:, :1]
     density = log_prob(mean, std, batch.action, mask)
-    weight = losses.step_weights(batch.valid)
     ratio, log_ratio = losses.policy_ratio(density, batch.proximal, batch.valid)
     loss = losses.surrogate_loss(
         ratio, batch.advantage, batch.importance, weight, config.clip_range
     )
     loss = loss - config.entropy_coefficient * losses.entropy_bonus(std, mask, weight)
-    real = jnp.sum(mask * weight[..., None])
     return loss, {
         "kl": losses.approximate_kl(ratio, log_ratio, weight),
         "clipped": losses.clipped_share(ratio, weight, config.clip_range),
-        "std": jnp.sum(std * mask * weight[..., None]) / real,
+        "std": jnp.sum(jnp.sum(std * mask, -1) / jnp.sum(mask, -1) * weight),
     }
 
 
-def critic_loss(config: TrainConfig, params, constants, batch: Batch):
-    """The value loss of the critic's parameters on a minibatch."""
+def critic_loss(config: TrainConfig, params, constants, batch: Batch, weight):
+    """The value loss of the critic's parameters on steps whose weights [N, T] are `weight`."""
     variables = {"params": params, **constants}
     values = apply_at_steps(
         Critic(config.critic), variables, batch.descriptions, batch.slot, batch.observation
     )
-    return losses.value_loss(values, batch.target, losses.step_weights(batch.valid))
+    return losses.value_loss(values, batch.target, weight)
 
 
 def constants(variables) -> dict:
