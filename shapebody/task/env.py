@@ -182,7 +182,9 @@ class Locomotion:
             arguments = keys[s], f, coefficients[s], streaks[s]
             if self.engine == "native":
                 ids = np.arange(group.count)
-                states += native_rollout.begin(self.config, group, ids, *arguments)
+                for chosen, state in native_rollout.begin(self.config, group, ids, *arguments):
+                    m = len(chosen)
+                    states.append(jax.tree.map(lambda x, m=m: np.asarray(x)[:m], state))
             else:
                 state, physics = mjx_rollout.begin(group, *arguments)
                 states.append(state)

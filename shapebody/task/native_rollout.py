@@ -127,7 +127,7 @@ def _single(x):
 
 def begin(
     config: TaskConfig, group: RobotGroup, ids, keys, designs, coefficients, streaks
-) -> list[Episode]:
+) -> list[tuple[np.ndarray, Episode]]:
     """Start episodes in environments `ids` [R] of a group, and put their bodies into its physics.
 
     They are started RESET_SLOTS at a time, so that one compiled function serves any number.
@@ -137,7 +137,8 @@ def begin(
         designs: [R, d], or None to draw them.
 
     Returns:
-        Their states in the same order, one Episode [at most RESET_SLOTS] per chunk.
+        (ids [at most RESET_SLOTS], Episode [RESET_SLOTS]) of each chunk, in the same order; slots
+        beyond the ids mean nothing.
     """
     states = []
     keys, coefficients, streaks = (np.asarray(x) for x in (keys, coefficients, streaks))
@@ -151,11 +152,11 @@ def begin(
             f = draw_designs(k, c, group.space.dim, config.design_radius)
         else:
             f = designs[rows]
-        started = group.jitted_start(k, f, c, streaks[rows])
-        state, embodiment, qpos, qvel = jax.tree.map(lambda x, m=m: np.asarray(x)[:m], started)
+        state, *body = group.jitted_start(k, f, c, streaks[rows])
+        embodiment, qpos, qvel = jax.tree.map(lambda x, m=m: np.asarray(x)[:m], body)
         group.physics.set_designs(chosen, embodiment)
         group.physics.set_state(chosen, qpos, qvel)
-        states.append(state)
+        states.append((chosen, state))
     return states
 
 
@@ -172,14 +173,16 @@ def restart(batch: Batch, state: Episode, rows, keys, designs, coefficient, stre
             continue
         f = None if designs is None else designs[own, : group.space.dim]
         ids = rows[own] - group.first
-        fresh = begin(batch.config, group, ids, keys[own], f, coefficient[own], streak[own])
-        if len(fresh) > 1:
-            fresh = [jax.tree.map(lambda *x: np.concatenate(x), *fresh)]
-        state = jax.tree.map(lambda old, new, at=rows[own]: _replaced(old, at, new), state, *fresh)
+        chunks = begin(batch.config, group, ids, keys[own], f, coefficient[own], streak[own])
+        for chosen, fresh in chunks:
+            # Slots beyond the chosen ones go nowhere: no environment has that number.
+            at = np.full(RESET_SLOTS, len(state.step))
+            at[: len(chosen)] = group.first + chosen
+            state = _put(state, at, fresh)
     return state
 
 
-def _replaced(old, rows, new):
-    result = np.array(old)
-    result[rows] = new
-    return result
+@jax.jit
+def _put(state: Episode, rows, fresh: Episode) -> Episode:
+    """The state with `fresh` [R] in its `rows` [R]; rows that there are not are left out."""
+    return jax.tree.map(lambda old, new: old.at[rows].set(new, mode="drop"), state, fresh)
