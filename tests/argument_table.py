@@ -327,6 +327,7 @@ TASK_FIELDS = dict(
     command_limit=optional(POSITIVE),
     action_delay=optional(integer(0, 1)),
     design_radius=array(2, right=(0.0, 1.0)),
+    repeat_after_fall=PROBABILITY,
     velocity_bound=optional(POSITIVE),
     fixed_coefficient=FLAG,
     curriculum_levels=integer(1, 10**400),

@@ -508,6 +508,30 @@ def test_restarted_episodes_have_designs_at_every_distance(go2, engine):
     assert size.min() < 0.15 and size.max() > 0.85 and abs(size.mean() - 0.5) < 0.12
 
 
+@pytest.mark.parametrize("engine", ["native", "mjx"])
+def test_a_design_may_come_again_after_a_fall(robot, engine):
+    def repeated(height, **changes):
+        """The share of episodes of one step that are followed by one of the same design."""
+        config = TaskConfig(**QUIET, termination_height=height, horizon=1, **changes)
+        config = replace(config, fixed_coefficient=True)
+        env = Locomotion(robot, 64, config=config, engine=engine)
+        first = env.reset(jax.random.PRNGKey(0), coefficient=0.2)
+        before = np.array(first.design)
+        state, steps = env.rollout(wave, None, first, jax.random.PRNGKey(0), 1)
+        assert np.all(steps.terminated if height > 1 else steps.truncated)
+        same = np.all(np.asarray(state.design) == before, axis=-1)
+        np.testing.assert_array_equal(steps.descriptions.joints[0], first.descriptions.joints)
+        assert np.all(np.any(np.asarray(state.key) != first.key, axis=-1))  # another episode of it
+        return same.mean()
+
+    falls, stands = 5.0, 0.0
+    assert 0.3 < repeated(falls, repeat_after_fall=0.5) < 0.7
+    if engine == "native":  # every case is compiled, which takes MJX long
+        assert repeated(falls) == 0
+        assert repeated(falls, repeat_after_fall=1.0) == 1
+        assert repeated(stands, repeat_after_fall=1.0) == 0
+
+
 def test_designs_at_every_distance(go2):
     """Root mean square of a design: 1 / sqrt(3) times its radius, which is uniform."""
 

@@ -105,6 +105,10 @@ class TaskConfig:
     """A design is drawn from U([-rc, rc]^d), with r uniform between these two. With (0, 1), bodies
     lie at every distance from the reference; with r = 1, hardly any is near it in many dimensions.
     """
+    repeat_after_fall: Probability = 0.0
+    """Probability that an episode that ended in a fall is followed by one of the same design.
+    Bodies on which the policy falls at once make up a small part of all steps, much smaller than
+    their part of all designs; repeating them gives them more."""
     velocity_bound: Positive | None = None
     """An episode ends when a velocity of the trunk or of a joint exceeds this (m/s, rad/s), and
     the trunk's is clipped to it; None: never. 100 in the ancestors."""

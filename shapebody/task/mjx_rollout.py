@@ -9,8 +9,8 @@ import jax
 import jax.numpy as jnp
 
 from shapebody.task.batch import Batch, RobotGroup
-from shapebody.task.episode import Episode
-from shapebody.task.randomization import draw_designs
+from shapebody.task.episode import Episode, Outcome
+from shapebody.task.randomization import following_designs
 from shapebody.task.trajectory import PolicyFunction, assembled, step_record
 
 
@@ -41,8 +41,7 @@ def compiled_rollout(batch: Batch, policy: PolicyFunction, length: int) -> Calla
         state, outcome, following = batch.advance(state, tuple(raw))
         record = step_record(state, observation, action, extra, outcome)
         if batch.auto_reset:
-            done = outcome.terminated | outcome.truncated
-            state, stepped = _restarted(batch, state, stepped, done, following)
+            state, stepped = _restarted(batch, state, stepped, outcome, following)
         return (state, tuple(stepped)), record
 
     def rollout(params, state, physics, key):
@@ -66,18 +65,21 @@ def begin(group: RobotGroup, keys, designs, coefficients, streaks):
     return state, group.physics.init(*physics)
 
 
-def _restarted(batch: Batch, state: Episode, physics, done, following):
-    """(state, physics) with new episodes where `done` [N].
+def _restarted(batch: Batch, state: Episode, physics, outcome: Outcome, following):
+    """(state, physics) with new episodes where one has ended.
 
     A compiled function has no branches by environment: new episodes are computed for all of them,
     and used in some.
     """
     coefficient, streak, keys = following
+    done = outcome.terminated | outcome.truncated
     fresh, restarted = [], []
-    radius = batch.config.design_radius
     for group, one in zip(batch.groups, physics, strict=True):
         s = group.slice
-        designs = draw_designs(keys[s], coefficient[s], group.space.dim, radius)
+        old = state.design[s, : group.space.dim]
+        designs = following_designs(
+            batch.config, keys[s], coefficient[s], old, outcome.terminated[s]
+        )
         new, embodiment, qpos, qvel = group.start(keys[s], designs, coefficient[s], streak[s])
         fresh.append(new)
         restarted.append(group.physics.reset(one, done[s], embodiment, qpos, qvel))

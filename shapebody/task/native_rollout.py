@@ -19,7 +19,7 @@ import numpy as np
 from shapebody.task.batch import RESET_SLOTS, Batch, RobotGroup
 from shapebody.task.config import TaskConfig
 from shapebody.task.episode import Episode
-from shapebody.task.randomization import draw_designs
+from shapebody.task.randomization import draw_designs, following_designs
 from shapebody.task.trajectory import PolicyFunction, assembled, step_record
 
 # ------------------------------------------------------------------ one control step
@@ -90,7 +90,8 @@ def control_step(batch: Batch, act, account, params, state: Episode, key, runnin
     if batch.auto_reset and done.any():
         rows = np.flatnonzero(done)
         coefficient, streak, keys = (np.asarray(x)[rows] for x in following)
-        state = restart(batch, state, rows, keys, None, coefficient, streak)
+        fell = record.terminated[rows]
+        state = restart(batch, state, rows, keys, None, coefficient, streak, fell)
     return state, record, outcome
 
 
@@ -126,7 +127,7 @@ def _single(x):
 
 
 def begin(
-    config: TaskConfig, group: RobotGroup, ids, keys, designs, coefficients, streaks
+    config: TaskConfig, group: RobotGroup, ids, keys, designs, coefficients, streaks, fell=None
 ) -> list[tuple[np.ndarray, Episode]]:
     """Start episodes in environments `ids` [R] of a group, and put their bodies into its physics.
 
@@ -135,6 +136,8 @@ def begin(
     Args:
         keys, coefficients, streaks: [R], of the new episodes.
         designs: [R, d], or None to draw them.
+        fell: bool [R], how the episodes ended that these follow; `designs` are then those of the
+            ended ones (`following_designs`).
 
     Returns:
         (ids [at most RESET_SLOTS], Episode [RESET_SLOTS]) of each chunk, in the same order; slots
@@ -150,6 +153,8 @@ def begin(
         k, c = keys[rows], coefficients[rows]
         if designs is None:
             f = draw_designs(k, c, group.space.dim, config.design_radius)
+        elif fell is not None:
+            f = following_designs(config, k, c, designs[rows], fell[rows])
         else:
             f = designs[rows]
         state, *body = group.jitted_start(k, f, c, streaks[rows])
@@ -160,20 +165,29 @@ def begin(
     return states
 
 
-def restart(batch: Batch, state: Episode, rows, keys, designs, coefficient, streak) -> Episode:
+def restart(
+    batch: Batch, state: Episode, rows, keys, designs, coefficient, streak, fell=None
+) -> Episode:
     """The state with new episodes in environments `rows` [R], ascending; others go on.
 
     Args:
         keys, coefficient, streak: [R] NumPy arrays.
         designs: [R, D], padded to the largest robot's d, or None to draw them.
+        fell: bool [R], whether the last episodes ended in a fall, after which a drawn design may be
+            the same one again.
     """
+    if designs is None and fell is not None:
+        designs = np.asarray(state.design)[rows]
     for group in batch.groups:
         own = group.owned(rows)
         if not own.any():
             continue
         f = None if designs is None else designs[own, : group.space.dim]
         ids = rows[own] - group.first
-        chunks = begin(batch.config, group, ids, keys[own], f, coefficient[own], streak[own])
+        before = None if fell is None else fell[own]
+        chunks = begin(
+            batch.config, group, ids, keys[own], f, coefficient[own], streak[own], before
+        )
         for chosen, fresh in chunks:
             # Slots beyond the chosen ones go nowhere: no environment has that number.
             at = np.full(RESET_SLOTS, len(state.step))

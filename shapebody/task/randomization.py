@@ -98,3 +98,18 @@ def draw_designs(keys, coefficients, dim: int, radius: tuple[float, float]):
         return design * (c * r)
 
     return jax.vmap(draw)(keys, coefficients)
+
+
+@partial(jax.jit, static_argnums=0)
+def following_designs(config: TaskConfig, keys, coefficients, designs, fell):
+    """Designs [n, d] of the episodes that follow: drawn anew, or, after some falls, the same.
+
+    keys, coefficients: [n], of the new episodes; designs: [n, d] of those that ended; fell:
+    bool [n], how.
+    """
+    new = draw_designs(keys, coefficients, designs.shape[-1], config.design_radius)
+    if config.repeat_after_fall == 0.0:
+        return new
+    draw = jax.vmap(lambda key: jax.random.uniform(jax.random.fold_in(key, 9)))
+    again = fell & (draw(keys) < config.repeat_after_fall)
+    return jnp.where(again[:, None], designs, new)
