@@ -11,6 +11,8 @@ from typing import Annotated, Literal
 
 import tyro
 
+from shapebody.arguments import require_integer, require_number, require_output
+
 Engine = Literal["auto", "native", "mjx"]
 RobotName = Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="ROBOT")]
 AgentName = Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="AGENT")]
@@ -52,7 +54,7 @@ def _train(words):
 
         agent = train(
             settings,
-            max_steps=steps,
+            max_steps=_steps(steps),
             max_seconds=_seconds(hours),
             engine=engine,
             state_only=state_only,
@@ -90,7 +92,7 @@ def _continue(words):
         _tell(
             continue_run(
                 agent,
-                max_steps=steps,
+                max_steps=_steps(steps),
                 max_seconds=_seconds(hours),
                 engine=engine,
                 state_only=state_only,
@@ -350,9 +352,11 @@ def _value_of(flag: str, words) -> str | None:
 
 
 def _seconds(hours: float | None) -> float | None:
-    from shapebody.arguments import require_number
-
     return None if hours is None else 3600 * require_number("--hours", hours, 0)
+
+
+def _steps(steps: int | None) -> int | None:
+    return None if steps is None else require_integer("--steps", steps, 1)
 
 
 def _tell(agent, otherwise: str = "") -> None:
@@ -364,8 +368,6 @@ def _tell(agent, otherwise: str = "") -> None:
 
 def _check_out(out, robot) -> None:
     """Before a search: whether its result can be written."""
-    from shapebody.arguments import require_output
-
     if out is None:
         return
     path = require_output("--out", out)

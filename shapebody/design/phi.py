@@ -123,7 +123,7 @@ def phi(reference: Reference, f) -> Embodiment:
 
     Args:
         reference: of a robot, `DesignSpace.reference_robot`.
-        f: float32 [d], within [-1, 1] (which is not looked at: `DesignSpace.validate` does that).
+        f: float32 [d], within [-1, 1] (not checked here; `DesignSpace.validate` does).
 
     Raises:
         TypeError: for another reference.
