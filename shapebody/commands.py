@@ -307,7 +307,6 @@ def _validate(words):
             robot: an MJCF or URDF file, or a name in data/robots.
             out: write the completed file to this MJCF file.
         """
-        from shapebody.arguments import require_output
         from shapebody.robot.report import validate_robot
 
         if out is not None:

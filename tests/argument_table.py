@@ -999,6 +999,12 @@ FUNCTIONS = {
         starts=integer(1, 10**6),
         episodes=integer(1, 10**6),
     ),
+    "reproduction.value_studies.policy_yardstick": dict(
+        robot=ROBOT,
+        agent=AGENT,
+        folder=optional(thing(lambda world: world.folder)),
+        bodies=integer(1, 10**6),
+    ),
     "reproduction.value_studies.size_share": dict(
         agent=AGENT,
         robot=ROBOT,

@@ -4,6 +4,7 @@ import dataclasses
 import json
 from pathlib import Path
 
+import jax
 import numpy as np
 import pytest
 from PIL import Image
@@ -427,3 +428,22 @@ def test_published_policy(results, agent, robot, tmp_path, monkeypatch):
     for scale in ("reduced", "full", "smoke"):
         monkeypatch.setenv("SHAPEBODY_SCALE", scale)
         assert value_studies.published_policy(robot, agent) == study
+
+
+def test_policies_are_measured_on_the_yardstick(results, agent, robot, tmp_path):
+    first = value_studies.policy_yardstick(robot, agent, bodies=3)
+    assert [(r["policy"], r["coefficient"]) for r in first["records"]] == [
+        ("shipped", 1.0),
+        ("shipped", 0.5),
+    ]
+    write_published(tmp_path, published_layers(), robot.name)
+    both = value_studies.policy_yardstick(robot, agent, tmp_path, bodies=3)
+    assert both["records"][:2] == first["records"]
+    assert [r["policy"] for r in both["records"][2:]] == ["published", "published"]
+    for record in both["records"]:
+        assert set(record["success"]) <= {0, 1} and len(record["returns"]) == 3
+    # Once stored, the published policy's records need no folder; another policy's are refused.
+    assert value_studies.policy_yardstick(robot, agent, bodies=3) == both
+    other = dataclasses.replace(agent, policy=jax.tree.map(lambda x: 2 * x, agent.policy))
+    with pytest.raises(ValueError, match="other settings"):
+        value_studies.policy_yardstick(robot, other, bodies=3)

@@ -1,4 +1,4 @@
-"""Value against return, the share of size in a gain, and the authors' policies."""
+"""Value against return, the share of size in a gain, and what policies are worth."""
 
 from dataclasses import replace
 
@@ -13,8 +13,15 @@ from shapebody.networks.published import load_published_policy
 from shapebody.optimizers.objective import Objective
 from shapebody.optimizers.search import METHODS, search
 from shapebody.reproduction.design_study import evaluation_config, require_counts
-from shapebody.reproduction.results import result, result_path, stored_result
+from shapebody.reproduction.results import (
+    result,
+    result_in_parts,
+    result_path,
+    stored_parts,
+    stored_result,
+)
 from shapebody.robot.robot import require_robot
+from shapebody.training.yardstick import BODIES, yardstick
 
 
 def value_against_return(
@@ -156,3 +163,48 @@ def published_policy(robot, agent, folder=None, starts: int = 10, episodes: int 
         ]
 
     return result(name, compute, recompute=True, starts=starts, episodes=episodes)
+
+
+def policy_yardstick(robot, agent, folder=None, bodies: int = BODIES) -> dict:
+    """The yardstick of an agent's policy and, where it is at hand, of the authors' published one.
+
+    Args:
+        robot: the robot of both policies.
+        agent: whose policy is measured.
+        folder: with the authors' files (`load_published_policy`). If it is not given, the stored
+            records of their policy are added, if there are any.
+        bodies: number B of bodies.
+
+    Returns:
+        {"records": ..., "provenance": ...} with a record per policy ("shipped", "published") and
+        coefficient c (1 and 0.5): success (0 or 1), returns and lengths of the B bodies.
+    """
+    require_robot(robot)
+    require_agent(agent)
+    require_counts(bodies=bodies)
+
+    def measured(policy, config, variables):
+        records = []
+        for c in (1.0, 0.5):
+            one = yardstick(config, variables, robot, c, bodies)
+            records.append(
+                {
+                    "policy": policy,
+                    "coefficient": c,
+                    "success": one.success.astype(int).tolist(),
+                    "returns": [round(value, 3) for value in one.returns.tolist()],
+                    "lengths": one.lengths.tolist(),
+                }
+            )
+        return records
+
+    def published():
+        module, variables = load_published_policy(folder, robot.name)
+        return measured("published", module.config, variables)
+
+    name = f"yardstick_{robot.name}"
+    parts = {"shipped": lambda: measured("shipped", agent.policy_config, agent.policy)}
+    settings = {"shipped": {"policy": agent.policy_hash}}
+    if folder is not None or "published" in stored_parts(name, bodies=bodies):
+        parts["published"] = published
+    return result_in_parts(name, parts, settings=settings, bodies=bodies)
