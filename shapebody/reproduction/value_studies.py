@@ -182,6 +182,8 @@ def policy_yardstick(robot, agent, folder=None, bodies: int = BODIES) -> dict:
     require_robot(robot)
     require_agent(agent)
     require_counts(bodies=bodies)
+    # Read before anything is measured.
+    theirs = None if folder is None else load_published_policy(folder, robot.name)
 
     def measured(policy, config, variables):
         records = []
@@ -199,12 +201,12 @@ def policy_yardstick(robot, agent, folder=None, bodies: int = BODIES) -> dict:
         return records
 
     def published():
-        module, variables = load_published_policy(folder, robot.name)
+        module, variables = theirs
         return measured("published", module.config, variables)
 
     name = f"yardstick_{robot.name}"
     parts = {"shipped": lambda: measured("shipped", agent.policy_config, agent.policy)}
     settings = {"shipped": {"policy": agent.policy_hash}}
-    if folder is not None or "published" in stored_parts(name, bodies=bodies):
+    if theirs is not None or "published" in stored_parts(name, bodies=bodies):
         parts["published"] = published
     return result_in_parts(name, parts, settings=settings, bodies=bodies)
