@@ -301,6 +301,20 @@ def readme_rows(name):
     return f"| {' | '.join(first)} |", f"| {' | '.join(second)} |", episodes, added, parts
 
 
+def yardstick_row(name: str) -> str:
+    path = data_dir() / "results" / f"yardstick_{name}.json"
+    success = {
+        (record["policy"], record["coefficient"]): f"{np.mean(record['success']):.0%}"
+        for record in reproduction_results.stored_result(path)["records"]
+    }
+    ours, theirs = (
+        f"{success[policy, 1.0]} and {success[policy, 0.5]}".replace("%", " %")
+        for policy in ("shipped", "published")
+    )
+    label = "success on 256 random bodies, c = 1 and 0.5"
+    return f"| {label} | {ours} (the authors' policy: {theirs}) |"
+
+
 def test_readme_states_the_stored_results():
     """The tables of agents, row by row, from data/results, and the sentences that go with them."""
     readme = (Path(__file__).parents[1] / "README.md").read_text()
@@ -316,6 +330,7 @@ def test_readme_states_the_stored_results():
         for cell in (*cells[0][1:], *cells[1][3:5]):
             assert cell in card, f"the card of {name} should have: {cell}"
         assert f"{episodes[0]} episodes a body" in card
+        assert yardstick_row(name) in card, f"the card of {name} should have: {yardstick_row(name)}"
         assert f"{episodes[0]} for the {load_robot(name).display_name}" in text
 
     go2, golem = (added[name] for name in ("unitree_go2", "golem"))
