@@ -77,7 +77,7 @@ def _continue(words):
         replace: bool = False,
         engine: Engine = "auto",
     ):
-        """Continue the training run of an agent exactly where it stopped.
+        """Continue the training run of an agent: exactly, or a shipped one with new episodes.
 
         Args:
             agent: name in data/checkpoints, or a folder.

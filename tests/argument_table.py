@@ -55,6 +55,7 @@ from shapebody.training.update import Learner
 INTERNAL = {
     "commands": "the command line, see the test of its words",
     "agent.description": "reads and writes agent.json, for `agent.store`",
+    "training.portable": "writes and reads states of `training.trainer`",
     "training.progress": "shows and records what `training.trainer` hands over",
     "training.replacing": "looks at folders of `training.train`",
     "training.run_state": "looks at folders of `training.trainer` and `training.train`",
@@ -195,6 +196,8 @@ UNCHECKED |= {
     "training.trainer.Trainer.alone": "takes nothing",
     "training.update.Batch": RESULT,
     "training.yardstick.Measured": RESULT,
+    "training.yardstick.curve_columns": "called by `Trainer.run`",
+    "training.yardstick.due": "called by `Trainer.run`",
     "training.update.require_variables": "a check itself, called by `init_learner`",
 }
 UNCHECKED |= dict.fromkeys(
@@ -212,7 +215,8 @@ UNCHECKED |= dict.fromkeys(
         f"training.update.{name}"
         for name in (
             "apply_at_steps constants critic_loss descend gradient_step gradient_steps "
-            "learned_policy learning_rate minibatch_rows optimizer policy_loss prepare"
+            "learned_policy learning_rate mapped minibatch_rows number_of_chunks optimizer "
+            "policy_loss prepare summed"
         ).split()
     ),
     FORMULA,
@@ -793,6 +797,7 @@ FUNCTIONS = {
         curve_interval=optional(COUNT),
     ),
     "training.trainer.Trainer.save": {},
+    "training.trainer.Trainer.save_portable": {},
     "training.trainer.Trainer.save_agent": dict(folder=optional(FOLDER)),
     "training.trainer.Trainer.everything": {},
     "training.trainer.Trainer.start": dict(

@@ -482,7 +482,7 @@ def files_of(folder):
 
 def test_a_run_of_damaged_files_goes_on_as_it_was_or_not_at_all(run, config):
     whole = files_of(run.folder)
-    assert {*run_state.STATE_FILES} == set(whole)
+    assert {run_state.STATE, run_state.PHASES, run_state.CURVE} == set(whole)
     run.start()
     before = [np.asarray(x) for x in jax.tree.leaves(run.everything())]
     trainer = copy.copy(run)

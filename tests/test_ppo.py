@@ -24,6 +24,8 @@ from shapebody.training.update import init_learner, ppo_update
 
 pytestmark = pytest.mark.usefixtures("quick")
 
+RUN_FILES = run_state.STATE, run_state.PHASES, run_state.CURVE
+
 
 def test_advantages_against_a_plain_loop():
     rng = np.random.default_rng(0)
@@ -434,7 +436,7 @@ def test_annealing_leaves_the_run_as_it_is(config, tmp_path, monkeypatch):
     trainer = training_trainer.Trainer(config, tmp_path)
     trainer.start()
     trainer.run(max_steps=2 * config.batch, progress=False)
-    before = {file: (tmp_path / file).read_bytes() for file in run_state.STATE_FILES}
+    before = {file: (tmp_path / file).read_bytes() for file in RUN_FILES}
     rate = np.interp(2 / config.iterations, [0, 1], config.learning_rate)
 
     steps, last_rate = 3 * config.batch, 1e-6
@@ -447,7 +449,7 @@ def test_annealing_leaves_the_run_as_it_is(config, tmp_path, monkeypatch):
     agent = train.anneal(tmp_path, **arguments)
     assert agent.metadata["steps"] == 5 * config.batch
     assert load_agent(tmp_path).hash == agent.hash
-    assert {file: (tmp_path / file).read_bytes() for file in run_state.STATE_FILES} == before
+    assert {file: (tmp_path / file).read_bytes() for file in RUN_FILES} == before
     assert not (tmp_path / "annealed").exists()
     phase = agent.metadata["phases"][-1]
     first, last = phase["config"]["learning_rate"]

@@ -84,7 +84,7 @@ def test_one_episode_of_each_design(robot):
 
 
 def test_curve_has_the_yardstick_and_training_does_not_notice(robot, tmp_path, monkeypatch):
-    monkeypatch.setattr(trainer, "CURVE_BODIES", 4)
+    monkeypatch.setattr(yardstick, "CURVE_BODIES", 4)
     config = TrainConfig.smoke(str(robot.path), total_steps=128 * 5)
 
     def run(name, interval, *budgets):

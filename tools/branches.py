@@ -23,10 +23,13 @@ from shapebody.reproduction.results import result_in_parts
 from shapebody.robot.robot import load_robot
 from shapebody.runtime import enable_compilation_cache
 from shapebody.training.run_state import (
-    STATE_FILES,
+    CURVE,
+    PHASES,
+    STATE,
     finished_iterations,
     read_config,
     run_folder,
+    saved_state,
 )
 from shapebody.training.trainer import Trainer
 from shapebody.training.update import learned_policy
@@ -47,7 +50,7 @@ def changed(config, changes: dict):
 def copied(run: Path, folder: Path) -> Path:
     """A copy of the run's files, unless there is one."""
     folder.mkdir(parents=True, exist_ok=True)
-    for name in reversed(STATE_FILES):  # the state comes last
+    for name in (PHASES, CURVE, (saved_state(run) or run / STATE).name):  # the state comes last
         if not (folder / name).exists():
             shutil.copyfile(run / name, folder / name)
     return folder

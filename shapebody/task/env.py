@@ -25,7 +25,6 @@ from shapebody.arguments import (
     require_key,
     require_kind,
     require_list,
-    require_number,
     single,
 )
 from shapebody.design.descriptions import Descriptions, Sizes
@@ -140,7 +139,7 @@ class Locomotion:
         self,
         key: jax.Array,
         designs=None,
-        coefficient: float = 1.0,
+        coefficient=1.0,
         spread: bool = False,
         keys: jax.Array | None = None,
     ) -> Episode:
@@ -150,7 +149,7 @@ class Locomotion:
             key: PRNG key; None where `keys` are given.
             designs: normalized designs, one [d] or one per environment [N, d] (padded to
                 the largest robot's d); None draws them from U(-rc, rc) (`design_radius`).
-            coefficient: curriculum coefficient c in [0, 1] of every environment.
+            coefficient: curriculum coefficient c in [0, 1], one number or [N].
             spread: cut the first episodes at random horizons, so that episodes do not all
                 end in the same step.
             keys: one key per environment instead of `key`, to pair episodes across designs.
@@ -161,25 +160,25 @@ class Locomotion:
         """
         # Arguments: a key, c and a streak of every episode.
         n = self.num_envs
-        require_number("coefficient", coefficient, 0, 1)
+        rows = np.arange(n)
+        c = _one_per_row("coefficient", coefficient, rows, "fiu", 0, 1, np.float32)
         require_flag("spread", spread)
         if key is not None or keys is None:
             require_key("key", key)
         keys = jax.random.split(key, n) if keys is None else require_key("keys", keys, (n,))
-        coefficients = jnp.full(n, coefficient, jnp.float32)
         streaks = jnp.zeros(n, jnp.int32)
 
         # Designs, and with them bodies, poses and commands.
         if designs is None:
             radius = self.config.design_radius
-            designs = np.asarray(draw_designs(keys, coefficients, self.design_dim, radius))
+            designs = np.asarray(draw_designs(keys, c, self.design_dim, radius))
         else:
             designs = self._validated(designs, n)
         states, physics_states = [], []
         for group in self.groups:
             s = group.slice
             f = designs[s, : group.space.dim]
-            arguments = keys[s], f, coefficients[s], streaks[s]
+            arguments = keys[s], f, c[s], streaks[s]
             if self.engine == "native":
                 ids = np.arange(group.count)
                 for chosen, state in native_rollout.begin(self.config, group, ids, *arguments):
@@ -396,5 +395,5 @@ def _one_per_row(name: str, value, rows, kinds: str, low: int, high: int, dtype)
     """One number for each of `rows`, from as many or one; ValueError if any is out of range."""
     values = require_array(name, value, kinds=kinds)
     if values.shape not in ((), rows.shape) or np.any((values < low) | (values > high)):
-        raise refuse(name, value, f"one number from {low} to {high}, or one for each of rows")
+        raise refuse(name, value, f"one number from {low} to {high}, or {len(rows)}")
     return np.broadcast_to(np.asarray(value, dtype), rows.shape)

@@ -55,9 +55,10 @@ class Actor:
         self._after = None  # the state after the latest finished rollout
         self._thread = self._pending = None
 
-    def reset(self, coefficient: float) -> None:
-        """Begin new episodes in all environments at this curriculum coefficient."""
-        self.state = self.env.reset(self.key, coefficient=coefficient, spread=True)
+    def reset(self, coefficient, number: int = 0) -> None:
+        """Begin new episodes before rollout `number`, at one curriculum coefficient or [N]."""
+        key = jax.random.fold_in(self.key, 2**31 + number) if number else self.key
+        self.state = self.env.reset(key, coefficient=coefficient, spread=True)
         self.physics = self._engine_state()
 
     def resume(self, behaviour, state, physics) -> None:

@@ -2,9 +2,13 @@
 
 The files of a run, in its folder:
 
-    training.safetensors  everything that determines its future
-    training.json         its configuration
-    training.csv          its learning curve
+    training.safetensors           everything that determines its future
+    training.portable.safetensors  the same in small, without the episodes (`portable`)
+    training.json                  its configuration
+    training.csv                   its learning curve
+
+Shipped runs have the second of them only, and go on with new episodes; from then on they have the
+first one, which wins.
 
 One rule: a run is continued with its own configuration, and any other configuration is another run
 with another name. `train.continue_run` takes the configuration from training.json, and is the only
@@ -38,7 +42,7 @@ from shapebody.stored import read_json, read_number
 from shapebody.training.config import MOST_STEPS, TrainConfig, robot_name
 
 STATE, PHASES, CURVE = "training.safetensors", "training.json", "training.csv"
-STATE_FILES = (STATE, PHASES, CURVE)
+PORTABLE = "training.portable.safetensors"
 
 ANEW = f"restore it, or delete {STATE} beside it to begin anew"
 """What to do about a damaged file of a run."""
@@ -87,14 +91,20 @@ def state_version(folder: Path):
         return None
 
 
+def saved_state(folder: Path) -> Path | None:
+    """The state of the run in a folder, the exact one if there are both; None without a run."""
+    paths = (folder / STATE, folder / PORTABLE)
+    return next((path for path in paths if path.exists()), None)
+
+
 def has_run(folder: Path) -> bool:
     """Whether there is a run in a folder."""
-    return state_version(folder) is not None
+    return saved_state(folder) is not None
 
 
 def finished_iterations(folder: Path) -> int:
     """Finished iterations of the run in a folder; ValueError if its state is damaged."""
-    path = folder / STATE
+    path = saved_state(folder) or folder / STATE
     fix = "restore it, or delete it to begin anew"
     number = read_number(path, "learner/iteration", fix)
     if number < 0:

@@ -27,7 +27,6 @@ from shapebody.training.run_state import (
     CURVE,
     PHASES,
     STATE,
-    STATE_FILES,
     finished_iterations,
     has_run,
     read_config,
@@ -37,6 +36,7 @@ from shapebody.training.run_state import (
     require_run,
     run_engine,
     run_folder,
+    saved_state,
 )
 from shapebody.training.trainer import Trainer
 
@@ -173,6 +173,8 @@ def _train(
             )
             require_replaceable(trainer.folder, begun, others)
         run_or_interrupt(trainer, progress, max_steps, max_seconds)
+        if trainer.steps > begun:
+            trainer.save_portable()
         if state_only:
             return None
         if not replace and trainer.steps == begun <= (steps_in(trainer.folder) or 0):
@@ -267,11 +269,12 @@ def _begin_annealing(
 
     A copy that is there already stays. Returns the configuration of the new phase.
     """
-    missing = [file for file in STATE_FILES if not (folder / file).exists()]
+    origin = saved_state(folder) or folder / STATE
+    missing = [path.name for path in (origin, folder / PHASES, folder / CURVE) if not path.exists()]
     if missing:
         raise ValueError(f"there is no run to anneal in {folder}: {missing[0]} is missing")
     # The state is read first: curve rows that are newer than it do no harm.
-    state = (folder / STATE).read_bytes()
+    state = origin.read_bytes()
     done, phases = finished_iterations(folder), read_phases(folder)
     read_config(folder)  # a check: the copy's configuration is made of what was written
     config = dict(phases[-1]["config"])
@@ -305,5 +308,5 @@ def _begin_annealing(
         atomic_write(copy / PHASES, json.dumps(phases, indent=1) + "\n")
         atomic_write(copy / CURVE, (folder / CURVE).read_bytes())
         # The state comes last: a copy without it is made again.
-        atomic_write(copy / STATE, state)
+        atomic_write(copy / origin.name, state)
     return from_json(TrainConfig, config)

@@ -31,14 +31,17 @@ from shapebody.runtime import keep_memory
 from shapebody.stored import ARRAYS_LIMIT
 from shapebody.task.env import Locomotion
 from shapebody.training.config import MOST_STEPS, TrainConfig, located
+from shapebody.training.portable import load_portable, save_portable
 from shapebody.training.progress import CURVE_INTERVAL, Curve, Progress, read_rows
 from shapebody.training.rollout import Actor, Failures, collect_states, make_policy_function
 from shapebody.training.run_state import (
     CURVE,
     PHASES,
+    PORTABLE,
     STATE,
     continued_phases,
     finished_iterations,
+    has_run,
     read_config,
     require_budget,
     require_run,
@@ -51,7 +54,7 @@ from shapebody.training.update import (
     ppo_update,
     require_variables,
 )
-from shapebody.training.yardstick import CURVE_BODIES, yardstick
+from shapebody.training.yardstick import curve_columns, due
 
 
 class Trainer:
@@ -205,7 +208,7 @@ class Trainer:
             require_choice("an entry of changeable", name, vars(self.config))
         # Before anything is read: what another trainer writes meanwhile is noticed in `run`.
         self.known = state_version(self.folder)
-        resumed = self.known is not None
+        resumed = has_run(self.folder)
         if resumed:
             # Before the arrays are read, whose shapes depend on the configuration.
             steps = finished_iterations(self.folder) * self.config.batch
@@ -218,15 +221,33 @@ class Trainer:
             first = {"from_step": 0, "config": to_json(self.config)}
             self.phases = [first | {"robots": robots, "engine": self.env.engine}]
             return False
-        saved = load_arrays(self.folder / STATE, self._as_saved())
-        self.learner, self.seconds = saved["learner"], float(saved["seconds"])
+        if self.known is None:
+            self._start_from_portable()
+        else:
+            self._start_exactly()
         # An average that is new begins with the policy; one that is no longer wanted goes.
         averages = self.config.average_half_life is not None
         if averages != (self.learner.average is not None):
             average = self.learner.policy["params"] if averages else None
             self.learner = replace(self.learner, average=average)
-        self.actor.resume(saved["behaviour"], saved["state"], saved["physics"])
         return True
+
+    def _start_exactly(self) -> None:
+        saved = load_arrays(self.folder / STATE, self._as_saved())
+        self.learner, self.seconds = saved["learner"], float(saved["seconds"])
+        self.actor.resume(saved["behaviour"], saved["state"], saved["physics"])
+
+    def _start_from_portable(self) -> None:
+        like, number = self._as_saved()["learner"], self.config.num_envs
+        saved = load_portable(self.folder / PORTABLE, like, number)
+        self.learner, coefficient, self.seconds = saved
+        self.actor.behaviour = self.learner.policy
+        self.actor.reset(coefficient, int(self.learner.iteration))
+
+    def save_portable(self) -> None:
+        """Write the small state from which the run can go on with new episodes."""
+        coefficient = np.asarray(self.actor.state.coefficient)
+        save_portable(self.folder / PORTABLE, self.learner, coefficient, self.seconds)
 
     # -------------------------------------------------------------- the agent
 
@@ -332,7 +353,10 @@ class Trainer:
                     failures.add(trajectory)
                     curve.add(trajectory, metrics, batch, None if compiling else elapsed)
                     if number % per_row == 0:
-                        measured = self._measured(per_row * batch)
+                        measured = {}
+                        if due(self.config.yardstick_interval, self.steps, per_row * batch):
+                            policy = self.config.policy, learned_policy(self.learner)
+                            measured = curve_columns(*policy, self.env.robots, self.env.engine)
                         # The yardstick takes time, but does not slow down the training itself.
                         mark = time.monotonic()
                         self.seconds += mark - now
@@ -357,30 +381,6 @@ class Trainer:
             actor.begin(self.learner.policy, number + 1)
         actor.wait()
         return metrics
-
-    def _measured(self, since: int) -> dict[str, float]:
-        """Columns of the yardstick, if it is due: once in `yardstick_interval` steps.
-
-        since: steps since it could have been measured last.
-        """
-        interval = self.config.yardstick_interval
-        if interval is None or self.steps // interval == (self.steps - since) // interval:
-            return {}
-        columns = {}
-        for name, coefficient in (("c1", 1.0), ("half", 0.5)):
-            measured = yardstick(
-                self.config.policy,
-                learned_policy(self.learner),
-                list(self.env.robots),
-                coefficient,
-                max(CURVE_BODIES, len(self.env.robots)),
-                self.env.engine,
-            )
-            columns |= {
-                f"success_{name}": float(np.mean(measured.success)),
-                f"return_{name}": float(np.mean(measured.returns)),
-            }
-        return columns
 
 
 def _check_state_bank(config: TrainConfig, sizes) -> None:

@@ -96,6 +96,25 @@ def yardstick(
     return Measured(np.asarray(success), results.returns, results.tracking_error, results.lengths)
 
 
+def due(interval: int | None, steps: int, since: int) -> bool:
+    """Whether a run of `steps` steps has to be measured, once in `interval` steps (None: never),
+    if that was last possible `since` steps ago."""
+    return interval is not None and steps // interval != (steps - since) // interval
+
+
+def curve_columns(config: PolicyConfig, policy, robots, engine: str) -> dict[str, float]:
+    """Mean success and return at c = 1 and c = 0.5, as columns of the learning curve."""
+    columns = {}
+    for name, coefficient in (("c1", 1.0), ("half", 0.5)):
+        bodies = max(CURVE_BODIES, len(robots))
+        measured = yardstick(config, policy, list(robots), coefficient, bodies, engine)
+        columns |= {
+            f"success_{name}": float(np.mean(measured.success)),
+            f"return_{name}": float(np.mean(measured.returns)),
+        }
+    return columns
+
+
 def _fixed_bodies(env: Locomotion):
     """Designs [B, D] of U([-1, 1]^d), padded with zeros, and a key for the episode of each."""
     designs = np.zeros((env.num_envs, env.design_dim), np.float32)
