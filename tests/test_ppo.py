@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 import pytest
+from tiny import tiny_robot
 
 from shapebody.agent.store import load_agent, load_curve, save_agent
 from shapebody.configuration import from_json, to_json
@@ -18,7 +19,15 @@ from shapebody.files import alone_in, data_dir
 from shapebody.networks.config import CriticConfig
 from shapebody.task.observations import Observation
 from shapebody.training import config as training_config
-from shapebody.training import losses, policy_evaluation, progress, rollout, run_state, train
+from shapebody.training import (
+    losses,
+    policy_evaluation,
+    progress,
+    rollout,
+    run_state,
+    train,
+    update,
+)
 from shapebody.training import trainer as training_trainer
 from shapebody.training.update import init_learner, ppo_update
 
@@ -764,3 +773,37 @@ def test_training_on_mjx_resumes(tmp_path):
     assert trainer.steps == 96 and np.any(np.asarray(trainer.actor.state.design))
     for a, b in zip(leaves(straight), leaves(trainer), strict=True):
         np.testing.assert_array_equal(a, b)
+
+
+def test_chunks_change_nothing_but_the_order_of_sums():
+    """Of arrays without numbers, too: a robot may have no collision spheres."""
+    x = {"a": np.arange(24.0, dtype=np.float32).reshape(6, 4), "none": np.zeros((6, 2, 0))}
+
+    def double(part):
+        return {"a": 2 * part["a"], "none": part["none"]}
+
+    def total(part):
+        return part["a"].sum(0)
+
+    for chunks in (1, 2, 3, 6):
+        mapped = update.mapped(double, x, chunks)
+        np.testing.assert_array_equal(mapped["a"], 2 * x["a"])
+        assert mapped["none"].shape == (6, 2, 0)
+        np.testing.assert_allclose(update.summed(total, x, chunks), x["a"].sum(0))
+    assert update.number_of_chunks(256, 32) == 8 and update.number_of_chunks(3, 8) == 1
+    assert update.number_of_chunks(6 * 7, 1024) == 42
+
+
+def test_a_robot_without_collision_spheres_learns(tmp_path):
+    text = tiny_robot(tmp_path).path.read_text()
+    bare = text.replace('<geom name="sphere_0" type="sphere" size="0.08" group="5"/>', "")
+    assert bare != text
+    (tmp_path / "bare.xml").write_text(bare)
+    config = training_config.TrainConfig.smoke(
+        str(tmp_path / "bare.xml"), num_envs=64, rollout_length=32, minibatch_size=2048
+    )
+    assert update.number_of_chunks(64, 32) == 2
+    trainer = training_trainer.Trainer(config, tmp_path / "run")
+    trainer.start()
+    trainer.run(max_steps=config.batch, progress=False)
+    assert trainer.env.sizes.spheres == 0 and trainer.steps == config.batch

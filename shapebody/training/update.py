@@ -211,7 +211,8 @@ def number_of_chunks(environments: int, length: int) -> int:
 
 
 def _chunked(tree, chunks: int):
-    return jax.tree.map(lambda x: x.reshape((chunks, -1) + x.shape[1:]), tree)
+    # Not -1 for the number of environments: a robot may have no collision spheres, so no numbers.
+    return jax.tree.map(lambda x: x.reshape((chunks, x.shape[0] // chunks) + x.shape[1:]), tree)
 
 
 def mapped(function, tree, chunks: int):
@@ -219,7 +220,7 @@ def mapped(function, tree, chunks: int):
     if chunks == 1:
         return function(tree)
     result = jax.lax.map(function, _chunked(tree, chunks))
-    return jax.tree.map(lambda x: x.reshape((-1,) + x.shape[2:]), result)
+    return jax.tree.map(lambda x: x.reshape((x.shape[0] * x.shape[1],) + x.shape[2:]), result)
 
 
 def summed(function, tree, chunks: int):
