@@ -118,7 +118,7 @@ def _anneal(words):
 
         Args:
             agent: name in data/checkpoints, or a folder.
-            steps: of that part.
+            steps: environment steps of that last part.
             hours: stop after this time; run again to continue.
             replace: replace the saved agent even if it has more steps or a critic of its own.
             engine: that of the run, or auto.
@@ -208,7 +208,7 @@ def _design(words):
             agent: name in data/checkpoints, or a folder; the agent named as the robot if not given.
             method: vgds, or another name of shapebody.METHODS.
             start: number of a start design; the reference if not given.
-            seed: of the search.
+            seed: seed of the random numbers of the search.
             trust_region: the weight λ of the soft trust region.
             freeze: parameters that stay as they are: size is the scale of the whole body. Alone,
                 without a name, it frees all, as in the paper.
@@ -273,7 +273,7 @@ def _evaluate(words):
             settings: of the evaluation.
             robot: name in data/robots, or a file; the agent's first robot if not given.
             start: number of a start design; the reference if not given.
-            seed: of the episodes.
+            seed: seed of the episodes: the same seed, the same episodes.
             engine: native is MuJoCo in C, mjx is JAX; auto: native on a CPU.
         """
         from shapebody.agent.store import load_agent

@@ -45,7 +45,7 @@ class TaskConfig:
     """
 
     horizon: Count = 1000
-    """Control steps per episode (20 s)."""
+    """Control steps per episode; 1,000 are 20 s."""
 
     command_limit: Positive | None = None
     """Largest commanded velocity in m/s (rad/s for yaw); None: min(1, 2 x mean robot dimension)."""

@@ -148,7 +148,8 @@ def read_config(folder: Path) -> TrainConfig:
     """
     if not has_run(folder):
         raise FileNotFoundError(
-            f"there is no run in {folder}: {STATE} is missing; begin one with shapebody.train(...)"
+            f"there is no run in {folder}: {STATE} is missing; begin one with "
+            "`python -m shapebody train` or shapebody.train(...)"
         )
     try:
         return from_json(TrainConfig, read_phases(folder)[-1].get("config"), "config")
