@@ -6,19 +6,21 @@ blocks of fixed order (`parameters.BLOCKS`), one entry per body, joint, motor, f
 robot, and each block has a range R. An *embodiment* e holds the properties themselves, in
 kilograms, metres and radians, as a physics engine wants them (`Embodiment`).
 
-Φ starts from a reference robot and changes it in one of two ways:
+Φ starts from a reference robot and changes a property by a factor or by an offset, and the passive
+forces of joints by both:
 
 - factors: value = reference x size x (1 + R f), for masses, inertias, torque limits, gains, ...
-- offsets: value = reference x size + R f, for positions, angles, joint ranges, ...
+- offsets: value = reference x size + R f, for positions; without size for angles and joint ranges
 
 where "size" is a power of the first block's three factors s (x, y, z) or of their mean a: lengths
-grow with s, masses with a³, inertias with s⁵. So f = 0 gives the reference, and |f| is the distance
-from it that the trust region of the search bounds.
+grow with s, masses with a³, inertias with s⁵. So f = 0 gives the reference. The search
+subtracts λ |f - f_ref|² / d from the value, where f_ref is 0 by default: large changes cost, and
+none is forbidden.
 
 Φ is written once, in JAX, as plain formulas. It can be compiled, mapped over designs and
 differentiated, and it is smooth in f but for two kinds of clipping (passive joint forces at 0,
-nominal positions at the joint limits). The search uses exactly this: the chain rule carries the
-critic's gradient with respect to the body back to the design, ∂V/∂f = ∂V/∂e · ∂Φ/∂f.
+nominal positions at the soft limits of the reference). The search uses exactly this: the chain rule
+carries the critic's gradient with respect to the body back to the design, ∂V/∂f = ∂V/∂e · ∂Φ/∂f.
 
 The paper names the properties; order, ranges and formulas were recovered from the authors'
 published designs, which Φ reproduces to the digits they are printed with.
@@ -133,12 +135,14 @@ def phi(reference: Reference, f) -> Embodiment:
     x = _changes(reference, f)
     robot = reference.embodiment
 
-    # Block 1, size: lengths along x, y and z are multiplied by s = 1 + R f; a is the mean of s.
+    # Block 1, size: in every local frame, lengths along its own x, y and z are multiplied by
+    # s = 1 + R f; a is the mean of s.
     s = 1 + x["size"][0]
     a = 1 + jnp.mean(x["size"])  # exactly 1 at the reference
 
-    # Blocks 2 to 4, mass m = m₀ a³ c (1 + R f) and principal inertias I = I₀ s⁵ c (1 + R f):
-    # c = 1 + R f changes both together, the other two each alone.
+    # Blocks 2 to 4, mass m = m₀ a³ g (1 + R f) and principal inertias I = I₀ s⁵ g (1 + R f):
+    # g = 1 + R f changes both together, the other two each alone. s⁵ is taken entry by entry, as
+    # the authors do; of a stretched solid it is the inertia only if all s are equal.
     coupled = 1 + x["coupled_mass"]
     mass = robot.body_mass[1:] * a**3 * coupled * (1 + x["mass"])
     inertia = robot.body_inertia[1:] * s**5 * coupled[:, None] * (1 + x["inertia"])

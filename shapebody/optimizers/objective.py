@@ -79,11 +79,11 @@ class Objective:
     states: Observation
     """The state bank, with leading axis M."""
     reference: jax.Array
-    """f_ref, float32 [d]."""
+    """f_ref, float32 [d]: from which the penalty measures. Not the `Reference` of Φ, a robot's."""
     free: jax.Array
     """Which entries of f count, bool [d]; the others are held at f_ref."""
     trust_region: jax.Array
-    """λ, float32 []."""
+    """λ, float32 []: weight of the penalty, not a radius."""
     values: DesignCritic = field(metadata=dict(static=True))
     """The critic as a function of designs and states."""
     batch_size: int = field(default=64, metadata=dict(static=True))

@@ -35,7 +35,7 @@ def vgds(objective, starts, key, config: VGDSConfig) -> Search:
     """Gradient ascent on Ĵ_λ from designs `starts` [S, d].
 
     All starts share the minibatches: they are compared on the same states, and the result of a
-    start does not depend on the others.
+    start does not depend on the others. Found is the last design whose objective is finite.
     """
     return _ascend(objective, starts, key, config, True)
 
@@ -67,6 +67,7 @@ def _run(objective, starts, key, config: VGDSConfig, value_gradient: bool):
     def iteration(carry, key):
         designs, adam_state = carry
         scores, gradient = score_and_gradient(designs, objective.batch(key))
+        # Optax minimizes: for an ascent it is given the negative gradient.
         update, adam_state = adam.update(-gradient, adam_state)
         moved = jnp.clip(designs + jnp.clip(update, -limit, limit), -1.0, 1.0)
         return (moved, adam_state), (designs, scores)

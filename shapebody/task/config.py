@@ -39,9 +39,10 @@ GAIT_PERIOD = 0.5
 class TaskConfig:
     """The velocity-tracking task (Appendix A).
 
-    The curriculum coefficient c in [0, 1] scales designs, initial poses, noise and pushes, and
-    the delay acts only at c > 0: at c = 0 the reference robot starts in its nominal pose and
-    feels none of them. Commands do not depend on c.
+    The curriculum coefficient c in [0, 1] scales designs, initial poses, noise, pushes and all
+    reward terms but T1 and T2; actions are late only at c > 0, and the height below which an
+    episode ends falls with 1 - c. So at c = 0 the reference robot starts in its nominal pose,
+    undisturbed, and is rewarded for tracking alone. Commands do not depend on c.
     """
 
     horizon: Count = 1000

@@ -4,10 +4,10 @@ The paper refers to earlier work for the rule; this is the rule of the authors' 
 What counts as a success changed there: it was the return of the episode at the time of the paper
 (`TaskConfig.ancestors`), and is the accuracy of tracking since.
 
-Each environment has its own c. A streak of successful episodes raises it faster and
-faster, a streak of failures lowers it likewise, by streak / `curriculum_levels`. Added here:
-an episode that is cut before `curriculum_length` without a fall is neither, as are many of a
-batch's first ones, whose horizons are staggered.
+c is how hard an episode is; `TaskConfig` says what it scales. Each environment has its own. A
+streak of successful episodes raises it faster and faster, a streak of failures lowers it likewise,
+by streak / `curriculum_levels`. Added here: an episode that is cut before `curriculum_length`
+without a fall is neither, as are many of a batch's first ones, whose horizons are staggered.
 """
 
 import jax.numpy as jnp
@@ -18,7 +18,8 @@ from shapebody.task.config import TaskConfig
 def is_conclusive(config: TaskConfig, length, terminated):
     """Whether an episode counts: it fell, or lasted long enough for a success.
 
-    length: control steps; terminated: whether it ended in a fall.
+    length: control steps; terminated: whether it ended before its horizon (a fall, too high a
+    velocity, or failed physics).
     """
     return terminated | (length >= config.curriculum_length)
 

@@ -49,7 +49,7 @@ class Outcome(NamedTuple):
 
     reward: jax.Array  # []
     terms: jax.Array  # [23] unweighted T_i
-    terminated: jax.Array  # [] bool: fell or became non-finite
+    terminated: jax.Array  # [] bool: fell, was too fast, or became non-finite
     truncated: jax.Array  # [] bool: reached the horizon
     finite: jax.Array  # [] bool
 
@@ -121,8 +121,8 @@ def observe(config: TaskConfig, episode: Episode):
 
 def control(config: TaskConfig, episode: Episode, action):
     """Take an action [J]: (episode, joint targets [J] in rad, trunk velocity [6], joint
-    velocities [J]). The velocities are what physics must start from: pushed, and clipped
-    to the design's limits."""
+    velocities [J]). Physics must start from these velocities: the trunk's after a possible
+    push, the joints' as the last step left them, within the design's limits."""
     action = jnp.clip(action, -10.0, 10.0) * episode.descriptions.joint_mask
     actions = jnp.stack([action, episode.actions[0], episode.actions[1]])
     applied = randomization.delayed_action(
@@ -214,7 +214,7 @@ def advance(config: TaskConfig, episode: Episode, readings: Readings):
 def next_coefficient(config: TaskConfig, episode: Episode, terminated):
     """(coefficient, streak) for the episode that follows a finished one.
 
-    terminated: bool, whether the finished one ended in a fall.
+    terminated: bool, whether the finished one ended before its horizon.
     """
     old = episode.coefficient, episode.streak
     if config.fixed_coefficient:

@@ -1,4 +1,4 @@
-"""Observations of one environment (Appendix A), normalized by fixed divisors (`SCALES`)."""
+"""Observations of one environment (Appendix A), most of them scaled by constants (`SCALES`)."""
 
 from dataclasses import dataclass
 
@@ -16,10 +16,10 @@ from shapebody.task.sensors import Readings
 class Observation:
     """What the networks see of the state (leading axes allowed); all within [-10, 10].
 
-    joints: position - nominal, velocity, last action, keep-nominal flag. feet: contact,
-    time on the ground, time in the air (critic only). general: angular velocity 3,
-    command 3, gait clock 4, gravity direction 3. privileged: linear velocity 3, height 1,
-    curriculum coefficient 1 (critic only).
+    joints: position - nominal, velocity, last action, keep-nominal flag. feet (critic only):
+    contact, time on the ground, time in the air. general: angular velocity 3,
+    command 3, gait clock 4, gravity direction 3. privileged (critic only): linear velocity 3,
+    height 1, curriculum coefficient 1.
     """
 
     joints: jax.Array  # [J, 4]

@@ -6,8 +6,8 @@ over the robot's own joints and feet, so padding does not count.
 
 Where the table leaves something open, the terms are:
 
-- T9, joint nominal deviation: over all joints while the command is zero, over those of arms and
-  head otherwise (`randomization.keep_nominal`);
+- T9, joint nominal deviation: over all joints while the command is zero, over those of arms,
+  head and waist otherwise (`randomization.keep_nominal`);
 - T18, self-collision: the pairs in excess of those that the design has in its nominal pose;
 - T20, foot air time: charged in every step on the ground, and with no wanted air time while the
   command is zero;
@@ -168,7 +168,10 @@ def t19_base_height(m):
 
 
 def t20_foot_air_time(m):
-    """T20: mean of min(air time - wanted, 0) over feet on the ground, s; 0.4 s wanted per metre."""
+    """T20: mean over all feet of min(air time - wanted, 0), s, with 0 for feet in the air.
+
+    0.4 s are wanted per metre of mean robot dimension, none while the command is zero.
+    """
     standing = jnp.all(m.command == 0)
     wanted = AIR_TIME_PER_METRE * jnp.mean(m.descriptions.dimensions)
     wanted = jnp.where(standing, 0.0, wanted)
@@ -184,7 +187,7 @@ def t21_symmetric_air(m):
 
 
 def t22_foot_slip(m):
-    """T22: -mean |v_xy|² of feet on the ground, (m/s)²."""
+    """T22: -mean over all feet of |v_xy|², (m/s)², with 0 for feet in the air."""
     return -_foot_mean(m.contact * jnp.sum(m.readings.foot_velocity[:, :2] ** 2, -1), m)
 
 
@@ -195,7 +198,7 @@ def t23_foot_z_velocity(m):
 
 @dataclass(frozen=True)
 class Term:
-    """One row of the paper's table of rewards: the term T_i and its coefficient w_i."""
+    """One row of the paper's table of rewards: the term T_i and its weight w_i."""
 
     number: int  # i, from 1
     name: str

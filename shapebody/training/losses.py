@@ -5,9 +5,11 @@ otherwise. Weights w are those of `step_weights`: they sum to 1 over the steps t
 here knows a network; what a trainer does with these functions is in `update.py`.
 
 Three policies occur in decoupled PPO (Hilton et al., 2022), since rollouts may be older than the
-update that learns from them: μ, which acted; π_old, the policy at the start of the update, around
-which the trust region lies; and π, which is learned. The losses take π / π_old as a ratio and
-π_old / μ as a truncated importance weight. With μ = π_old, this is PPO.
+update that learns from them: μ, which acted; π_old, the policy at the start of the update, to which
+the clip ε keeps π close; and π, which is learned. The losses take π / π_old as a ratio and
+π_old / μ as a truncated importance weight. With μ = π_old, this is PPO. In the code, log
+densities under them are `behaviour` (μ; in a rollout its `extra`), `proximal` (π_old) and
+`log_prob` (π).
 """
 
 import jax
@@ -34,7 +36,7 @@ def advantages(reward, value, last_value, terminated, truncated, discount, gae_l
         last_value: V of the state after the last step.
         terminated, truncated: bool, how an episode ended in that step.
         discount: γ, 0 to 1.
-        gae_lambda: λ, the GAE parameter, 0 to 1.
+        gae_lambda: λ, the GAE parameter, 0 to 1; not the λ of the design search.
 
     Raises:
         ValueError: for arrays of other shapes.

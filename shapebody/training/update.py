@@ -41,13 +41,13 @@ class Batch:
 
     observation: Any
     descriptions: Any  # [N, 2, ...] the designs at the rollout's start and end
-    slot: jax.Array  # which of the two
-    valid: jax.Array
+    slot: jax.Array  # which of the two a step is of, 0 or 1
+    valid: jax.Array  # 0 where it is of neither: its episode began and ended in the rollout
     action: jax.Array
     target: jax.Array  # TD(λ) return
     advantage: jax.Array  # normalized
-    proximal: jax.Array | None = None  # log density of the action under π_old; None if only
-    importance: jax.Array | None = None  # the critic learns, like π_old / μ
+    proximal: jax.Array | None = None  # log density under π_old; None if only the critic learns
+    importance: jax.Array | None = None  # min(π_old / μ, 2); None likewise
 
 
 def init_learner(config: TrainConfig, policy, critic) -> Learner:
@@ -146,6 +146,7 @@ def prepare(config: TrainConfig, learner: Learner, trajectory: Trajectory):
             reward, value, last_value, terminated, truncated, config.discount, gae_lambda
         )
 
+    # Targets of the critic; advantages, which may also end where the command changes.
     value_lambda = config.gae_lambda if config.value_lambda is None else config.value_lambda
     target = estimate(truncated, value_lambda) + value
     cut = truncated
@@ -161,12 +162,14 @@ def prepare(config: TrainConfig, learner: Learner, trajectory: Trajectory):
         target=target,
         advantage=losses.normalized(advantage, valid),
     )
+    # Densities under π_old, and importance weights.
     if config.learn_policy:
         center = learned_policy(learner) if config.average_proximal else learner.policy
         mean, std = mapped(lambda x: apply_at_steps(policy, center, *x), inputs, chunks)
         proximal = log_prob(mean, std, batch.action, descriptions.joint_mask[:, :1])
         importance = losses.importance_weight(proximal, by_env(trajectory.extra))
         batch = replace(batch, proximal=proximal, importance=importance)
+    # How well the critic predicted its targets.
     _, residual = losses.moments(target - value, valid)
     _, spread = losses.moments(target, valid)
     return batch, {
