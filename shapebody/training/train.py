@@ -192,7 +192,7 @@ def run_or_interrupt(trainer: Trainer, progress, max_steps=None, max_seconds=Non
     except KeyboardInterrupt:
         saved = has_run(trainer.folder)
         if progress and saved:
-            print("\ninterrupted: saved, the same call continues; half a minute more", flush=True)
+            print("\ninterrupted: saved, the same call continues", flush=True)
         elif progress:
             print("\ninterrupted before the first iteration: nothing was saved", flush=True)
         if not saved:
