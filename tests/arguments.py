@@ -272,7 +272,7 @@ def _(world):
 
 @makes("designs_critic", "optimizers.objective.DesignCritic")
 def _(world):
-    return world.objective.values
+    return world.objective.design_critic
 
 
 @makes("env", "task.env.Locomotion")

@@ -363,7 +363,7 @@ def test_readme_states_the_example_and_the_mean():
     ten = [np.mean(list(found[method].values())) for method in ("none", "vgds", "penalty-only")]
     for start, end, alone, words in (
         (*one, "{:.1f} to {:.1f} (penalty only: {:.1f})"),
-        (*ten, "over ten starts from {:.1f} to {:.1f} ({:.1f})"),
+        (*ten, "over ten random bodies from {:.1f} to {:.1f} ({:.1f})"),
     ):
         assert words.format(start, end, alone) in text
 

@@ -102,18 +102,28 @@ class Descriptions:
     """Descriptions of one design, float32, padded with zeros to `Sizes` (J, F, S).
 
     Joints are the actuated ones, in actuator order. Masks are 1 for real entries, 0 for padding.
+    The columns of the three vectors that networks see, in order (Appendix A, `NORMALIZERS`):
+
+    - whole robot, 7: P gain, D gain, action scale, total mass, length, width, height
+    - a body, 7: mass, centre of mass x y z, principal inertias 3
+    - `joints`, 30: position 3, axis 3, the joint's body 7, children, nominal position, torque
+      limit, velocity limit, damping, armature, stiffness, friction, range 2, whole robot 7
+    - `feet`, 21: position 3, the foot's body 7, size 3, type, whole robot 7
+    - `static`, 14: whole robot 7, trunk 7
+
+    Positions are of the nominal pose, from -1 to 1 across the robot's bounding box.
     """
 
     joints: jax.Array  # [J, 30] normalized joint descriptions d_j
     joint_mask: jax.Array  # [J]
     feet: jax.Array  # [F, 21] normalized foot descriptions d_f
     foot_mask: jax.Array  # [F]
-    static: jax.Array  # [14] normalized gains and scale 3, total mass 1, dimensions 3, trunk 7
+    static: jax.Array  # [14] of the whole robot and its trunk, for the core networks
     nominal: jax.Array  # [J] rad
     action_scale: jax.Array  # [] rad
     velocity_limits: jax.Array  # [J] rad/s
     soft_limits: jax.Array  # [J, 2] rad, of the design's own joint ranges
-    keep_nominal: jax.Array  # [J] 1 for arms, head, waist
+    keep_nominal: jax.Array  # [J] 1 for joints that always should: arms, head, waist
     foot_size: jax.Array  # [F, 3] m, as in MuJoCo
     foot_is_box: jax.Array  # [F]
     foot_pairs: jax.Array  # [F, F] 1 at (i, j), i < j, for feet that mirror each other

@@ -92,7 +92,9 @@ MODEL_FIELDS = tuple(
 class Reference:
     """What Φ starts from: a robot's own embodiment, and constants that no design changes.
 
-    Made by `reference_of`; a pytree of float32 arrays, so that it can be passed into compiled code.
+    Made by `reference_of`, kept as `DesignSpace.reference_robot`. Not the reference design, which
+    is f = 0 (`DesignSpace.reference`), nor f_ref, from which a trust region measures. A pytree of
+    float32 arrays, so that it can be passed into compiled code.
     nb bodies (without the world), nj hinge joints, nu motors, nf feet.
     """
 
@@ -133,7 +135,7 @@ def phi(reference: Reference, f) -> Embodiment:
     """
     require_kind("reference", reference, Reference, "DesignSpace(robot).reference_robot")
     x = _changes(reference, f)
-    robot = reference.embodiment
+    original = reference.embodiment
 
     # Block 1, size: in every local frame, lengths along its own x, y and z are multiplied by
     # s = 1 + R f; a is the mean of s.
@@ -144,84 +146,84 @@ def phi(reference: Reference, f) -> Embodiment:
     # g = 1 + R f changes both together, the other two each alone. s⁵ is taken entry by entry, as
     # the authors do; of a stretched solid it is the inertia only if all s are equal.
     coupled = 1 + x["coupled_mass"]
-    mass = robot.body_mass[1:] * a**3 * coupled * (1 + x["mass"])
-    inertia = robot.body_inertia[1:] * s**5 * coupled[:, None] * (1 + x["inertia"])
+    mass = original.body_mass[1:] * a**3 * coupled * (1 + x["mass"])
+    inertia = original.body_inertia[1:] * s**5 * coupled[:, None] * (1 + x["inertia"])
 
     # Blocks 5 to 8, frames of the inertia and of the body: p = p₀ s + R f, turned by the angle R f
     # about a constant axis.
-    ipos = robot.body_ipos[1:] * s + x["ipos"]
-    iquat = turned(robot.body_iquat[1:], reference.inertia_axes, x["iquat"])
-    pos = robot.body_pos[1:] * s + x["pos"]
-    quat = turned(robot.body_quat[1:], reference.body_axes, x["quat"])
+    ipos = original.body_ipos[1:] * s + x["ipos"]
+    iquat = turned(original.body_iquat[1:], reference.inertia_axes, x["iquat"])
+    pos = original.body_pos[1:] * s + x["pos"]
+    quat = turned(original.body_quat[1:], reference.body_axes, x["quat"])
 
     # Block 9, IMU: p = p₀ s + R f. The other sites, like geoms, only follow the size.
     site_scale = jnp.where(reference.on_robot_sites[:, None] > 0, s, 1)
-    site_pos = robot.site_pos * site_scale + reference.imu * x["imu"]
+    site_pos = original.site_pos * site_scale + reference.imu * x["imu"]
 
     # Block 10, feet: r = r₀ a (1 + R f), and so the radius of the bounding sphere.
     # One-hot sums instead of scatters: exact, and faster in a batch on a CPU.
     on_robot = reference.on_robot_geoms > 0
     geom_scale = jnp.where(on_robot, a, 1)
     foot_scale = 1 + jnp.sum(reference.feet[:, :, None] * x["foot"], axis=1)
-    geom_size = robot.geom_size * geom_scale[:, None] * foot_scale
+    geom_size = original.geom_size * geom_scale[:, None] * foot_scale
     # The bounding radius of a sphere or a box is the norm of its size; written relative to the
     # reference, so that f = 0 gives exactly that.
     stretch = jnp.sqrt(1 + jnp.sum(reference.size_share * (foot_scale**2 - 1), axis=1))
-    rbound = robot.geom_rbound * geom_scale * stretch
-    geom_pos = robot.geom_pos * jnp.where(on_robot[:, None], s, 1)
+    rbound = original.geom_rbound * geom_scale * stretch
+    geom_pos = original.geom_pos * jnp.where(on_robot[:, None], s, 1)
 
     # Block 11, joint axes: tilted by the angle R f towards a constant perpendicular direction.
     cosine, sine = jnp.cos(x["axis"])[:, None], jnp.sin(x["axis"])[:, None]
-    axis = cosine * robot.jnt_axis[1:] + sine * reference.axis_directions
+    axis = cosine * original.jnt_axis[1:] + sine * reference.axis_directions
 
     # Blocks 12, 24 and 25, motors: v = v₀ a (1 + R f) for the torque limit of each and the gains
     # of all. A motor is a position servo, torque = P (target - q) - D q̇, whose gains MuJoCo keeps
     # in two tables.
-    torque = robot.actuator_forcerange[:, 1] * a * (1 + x["torque"])
-    p_gain = (robot.p_gain * a * (1 + x["p_gain"]))[0]
-    d_gain = (robot.d_gain * a * (1 + x["d_gain"]))[0]
+    torque = original.actuator_forcerange[:, 1] * a * (1 + x["torque"])
+    p_gain = (original.p_gain * a * (1 + x["p_gain"]))[0]
+    d_gain = (original.d_gain * a * (1 + x["d_gain"]))[0]
     p_column = jnp.broadcast_to(p_gain, (len(torque), 1))
     d_column = jnp.broadcast_to(d_gain, (len(torque), 1))
-    gain, bias = robot.actuator_gainprm, robot.actuator_biasprm
+    gain, bias = original.actuator_gainprm, original.actuator_biasprm
 
     # Blocks 13 and 15, nominal positions and joint ranges: q = q₀ + R f. The former stay within
     # the soft limits of the reference, at f = 0 too; the latter are not ordered.
     low, high = reference.soft_limits[:, 0], reference.soft_limits[:, 1]
-    nominal = jnp.clip(robot.nominal + x["nominal"], low, high)
-    jnt_range = robot.jnt_range[1:] + x["range"]
+    nominal = jnp.clip(original.nominal + x["nominal"], low, high)
+    jnt_range = original.jnt_range[1:] + x["range"]
 
     # Blocks 16 to 23, passive forces of the joints: v = max(0, v₀ a (1 + R f) + R' f').
     def passive(values, key):
         return jnp.maximum(0, values * a * (1 + x[key]) + x[f"{key}_add"])
 
-    stiffness = passive(robot.jnt_stiffness[1:], "stiffness")
-    damping = passive(robot.dof_damping[6:], "damping")
-    armature = passive(robot.dof_armature[6:], "armature")
-    frictionloss = passive(robot.dof_frictionloss[6:], "friction")
+    stiffness = passive(original.jnt_stiffness[1:], "stiffness")
+    damping = passive(original.dof_damping[6:], "damping")
+    armature = passive(original.dof_armature[6:], "armature")
+    frictionloss = passive(original.dof_frictionloss[6:], "friction")
 
     # Blocks 14 and 26, what the environment applies: v = v₀ a (1 + R f) for the velocity limits,
     # to which it clips the joints' velocities, and for the angle that an action of 1 stands for.
-    velocity = robot.velocity_limits * a * (1 + x["velocity"])
-    action_scale = (robot.action_scale * a * (1 + x["action_scale"]))[0]
+    velocity = original.velocity_limits * a * (1 + x["velocity"])
+    action_scale = (original.action_scale * a * (1 + x["action_scale"]))[0]
 
     return Embodiment(
-        body_mass=_completed(robot.body_mass, mass),
-        body_inertia=_completed(robot.body_inertia, inertia),
-        body_ipos=_completed(robot.body_ipos, ipos),
-        body_iquat=_completed(robot.body_iquat, iquat),
-        body_pos=_completed(robot.body_pos, pos),
-        body_quat=_completed(robot.body_quat, quat),
+        body_mass=_completed(original.body_mass, mass),
+        body_inertia=_completed(original.body_inertia, inertia),
+        body_ipos=_completed(original.body_ipos, ipos),
+        body_iquat=_completed(original.body_iquat, iquat),
+        body_pos=_completed(original.body_pos, pos),
+        body_quat=_completed(original.body_quat, quat),
         site_pos=site_pos,
         geom_pos=geom_pos,
         geom_size=geom_size,
         geom_rbound=rbound,
-        jnt_pos=_completed(robot.jnt_pos, robot.jnt_pos[1:] * s),
-        jnt_axis=_completed(robot.jnt_axis, axis),
-        jnt_range=_completed(robot.jnt_range, jnt_range),
-        jnt_stiffness=_completed(robot.jnt_stiffness, stiffness),
-        dof_damping=_completed(robot.dof_damping, damping),
-        dof_armature=_completed(robot.dof_armature, armature),
-        dof_frictionloss=_completed(robot.dof_frictionloss, frictionloss),
+        jnt_pos=_completed(original.jnt_pos, original.jnt_pos[1:] * s),
+        jnt_axis=_completed(original.jnt_axis, axis),
+        jnt_range=_completed(original.jnt_range, jnt_range),
+        jnt_stiffness=_completed(original.jnt_stiffness, stiffness),
+        dof_damping=_completed(original.dof_damping, damping),
+        dof_armature=_completed(original.dof_armature, armature),
+        dof_frictionloss=_completed(original.dof_frictionloss, frictionloss),
         actuator_forcerange=jnp.stack([-torque, torque], axis=-1),
         actuator_gainprm=jnp.concatenate([p_column, gain[:, 1:]], axis=1),
         actuator_biasprm=jnp.concatenate([bias[:, :1], -p_column, -d_column, bias[:, 3:]], axis=1),

@@ -22,10 +22,12 @@ class PolicyConfig:
     """
 
     key_widths: Widths = (256, 256)
-    """Widths of the layers that make a joint's key. The last one is the latent dimension L over
-    which the softmax runs."""
+    """Widths of the layers that make a joint's key of its description and observation. The last
+    one is the length L of the key. The softmax runs over the entries of one joint's key, not over
+    joints."""
     value_latent: Width = 4
-    """Width of a joint's value."""
+    """Length v of a joint's value. The outer product of key and value, summed over joints, is the
+    latent of L v numbers that enters the core."""
     core_widths: Widths = (512, 256, 256, 256, 256)
     """Widths of the core network. The last one must equal the last key width, because an action
     mean is the dot product of the two."""
@@ -37,8 +39,9 @@ class PolicyConfig:
     minimum_temperature: NonNegative = 0.025
     """Lower bound of the temperature."""
     latent_scale: Positive = 1.0
-    """Factor on the summed latent before it enters the core; the paper has none (1.0). Some
-    shipped agents were trained with 8.0."""
+    """Factor on the summed latent before it enters the core; the paper has none (1.0). A latent
+    that is scaled up drowns the command, which enters the core beside it; some shipped agents were
+    trained with 8.0."""
     initial_std: Positive = 1.0
     """Standard deviation of all actions before training."""
     log_std_input: Literal["tanh", "softmax"] = "tanh"
@@ -86,9 +89,9 @@ class CriticConfig:
     heads: Width = 3
     """Number K of value heads on the shared encoders."""
     joint_key_widths: Widths = (64, 64)
-    """Widths of the layers that make a joint's key; the softmax runs over the last one."""
+    """Widths of the layers that make a joint's key, see `PolicyConfig`."""
     joint_value_latent: Width = 32
-    """Width of a joint's value."""
+    """Length of a joint's value, see `PolicyConfig`."""
     foot_key_widths: Widths = (32, 32)
     """The same for feet."""
     foot_value_latent: Width = 32

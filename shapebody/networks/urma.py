@@ -1,9 +1,13 @@
 """What policy and critics are built of: the encoder of joints and feet (eq. 3), and the core.
 
-A robot is a set of joints and a set of feet, each with a description d and an observation o. Every
-part is encoded on its own and the parts are summed, so one network serves any number of them:
+In the Unified Robot Morphology Architecture (URMA) a robot is a set of joints and a set of feet,
+each with a description d and an observation o. Every part is encoded on its own and the parts are
+summed, so one network serves any number of them:
 
     latent = sum over parts of softmax(tanh(key(d, o)) / temperature) outer value
+
+The softmax runs over the L entries of one part's key. So a key says to which rows of the latent,
+and in which shares, this part adds its value: an address, not attention between parts.
 
 The value is a function of o in the policy and in the original critic, and of (d, o) in the
 direct-design critic. The sum, together with the general observations, enters a core network.

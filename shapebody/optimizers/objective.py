@@ -29,8 +29,10 @@ MAX_ROWS = 8192
 
 @dataclass(frozen=True, eq=False)
 class DesignCritic:
-    """The critic as a function of the normalized design: V(s, Φ(f)) for one robot.
+    """The critic of one robot as a function of the design, in two steps: V(s, Φ(f)).
 
+    `descriptions(designs)` applies Φ and describes the bodies; calling the instance gives their
+    values. A search does the first once per design and the second on every slice of the states.
     Instances are shared (`design_critic`), so that what was compiled for one is compiled for all
     searches on that robot with a critic of that size.
     """
@@ -74,7 +76,7 @@ class Objective:
     seed needs no new compilation.
     """
 
-    critic: Any
+    critic_variables: Any
     """Variables of the critic."""
     states: Observation
     """The state bank, with leading axis M."""
@@ -84,7 +86,7 @@ class Objective:
     """Which entries of f count, bool [d]; the others are held at f_ref."""
     trust_region: jax.Array
     """λ, float32 []: weight of the penalty, not a radius."""
-    values: DesignCritic = field(metadata=dict(static=True))
+    design_critic: DesignCritic = field(metadata=dict(static=True))
     """The critic as a function of designs and states."""
     batch_size: int = field(default=64, metadata=dict(static=True))
     """States per minibatch."""
@@ -121,8 +123,8 @@ class Objective:
         require_number("trust_region", trust_region, 0, LARGEST_LAMBDA, hint=hint)
         require_integer("batch_size", batch_size, 1)
         require_robot(robot)
-        values = design_critic(robot, agent.critic_config)
-        space = values.space
+        critic = design_critic(robot, agent.critic_config)
+        space = critic.space
         reference = space.reference if reference is None else space.validate(reference)
         if reference.ndim != 1:
             raise ValueError(
@@ -130,12 +132,12 @@ class Objective:
             )
         states = bank(agent, robot) if states is None else trim(states, robot)
         return cls(
-            critic=jax.tree.map(jnp.asarray, agent.critic),
+            critic_variables=jax.tree.map(jnp.asarray, agent.critic),
             states=jax.tree.map(lambda x: jnp.asarray(x, jnp.float32), states),
             reference=jnp.asarray(reference),
             free=jnp.asarray(~space.frozen(frozen)),
             trust_region=jnp.asarray(trust_region, jnp.float32),
-            values=values,
+            design_critic=critic,
             batch_size=int(batch_size),
         )
 
@@ -151,7 +153,9 @@ class Objective:
 
     def hold(self, designs):
         """Designs [..., d] with the frozen entries at f_ref."""
-        return jnp.where(self.free, self.values.space.as_float32(designs, jnp), self.reference)
+        return jnp.where(
+            self.free, self.design_critic.space.as_float32(designs, jnp), self.reference
+        )
 
     def batch(self, key) -> Observation:
         """A minibatch of states, drawn without replacement; the whole bank if it is smaller."""
@@ -164,7 +168,7 @@ class Objective:
     def value(self, designs, states: Observation | None = None):
         """Mean of V̄ over `states` (the whole bank if not given) for designs [..., d] -> [...]."""
         designs = self.hold(designs)
-        states = self.states if states is None else trim(states, self.values.space.robot)
+        states = self.states if states is None else trim(states, self.design_critic.space.robot)
         rows = designs.reshape(-1, designs.shape[-1])
         return mean_value(self, rows, states).reshape(designs.shape[:-1])
 
@@ -185,11 +189,12 @@ class Objective:
 @jax.jit
 def mean_value(objective: Objective, designs, states: Observation):
     """Mean value [S] of designs [S, d] over states and heads, in slices of the states."""
-    descriptions = objective.values.descriptions(designs)
+    critic = objective.design_critic
+    descriptions = critic.descriptions(designs)
     count = states.general.shape[0]
     size = min(count, max(1, MAX_ROWS // len(designs)))
     if size == count:
-        values = objective.values(objective.critic, descriptions, states)
+        values = critic(objective.critic_variables, descriptions, states)
         return jnp.mean(values, axis=(-2, -1))
     slices = -(-count // size)
     index = np.arange(slices * size)
@@ -198,7 +203,7 @@ def mean_value(objective: Objective, designs, states: Observation):
 
     def total(part):
         states, weight = part
-        values = objective.values(objective.critic, descriptions, states)
+        values = critic(objective.critic_variables, descriptions, states)
         return jnp.sum(jnp.mean(values, axis=-1) * weight, axis=-1)
 
     return jnp.sum(jax.lax.map(total, (parts, weight)), axis=0) / count

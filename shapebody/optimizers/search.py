@@ -13,8 +13,11 @@ To add a method:
 2. Write its function there. If the method proposes designs and learns from their scores, that is
    one call of `loop.iterate` with three small functions: `cem` is a short example. Otherwise write
    the loop yourself, as `vgds` does.
+   `Search.evaluations` counts the scores that the method uses. That of the current recommendation,
+   `Scored.current`, counts only if it is used, as in `turbo`, and not if it only fills `history`.
 3. Enter both in `METHODS`. `search`, the design studies and the tests of all methods
    (tests/test_baselines.py) then know it.
+4. Give it a colour and a label in `show.study_plots.METHOD_STYLES`, for the notebooks' figures.
 """
 
 from __future__ import annotations
@@ -141,7 +144,7 @@ def search(
     function, config = _method(method, settings)
     require_seed("seed", seed)
     objective = Objective.of(agent, robot, trust_region, reference, states, batch_size, frozen)
-    starts = objective.values.space.validate(f)
+    starts = objective.design_critic.space.validate(f)
     if starts.ndim > 2 or len(starts) == 0:
         raise ValueError(
             f"f has shape {starts.shape}; expected one design [{objective.dim}] or at least one "

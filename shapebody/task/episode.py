@@ -31,7 +31,7 @@ class Episode:
     step: jax.Array  # [] int32, control steps so far
     horizon: jax.Array  # [] int32, step at which the episode is cut
     command: jax.Array  # [3]
-    keep_nominal: jax.Array  # [J]
+    keep_nominal: jax.Array  # [J] 1 for joints that should, at this command
     actions: jax.Array  # [3, J] newest first
     delay: jax.Array  # [] int32
     mixed_delay: jax.Array  # [] bool

@@ -41,7 +41,7 @@ class Moment(NamedTuple):
     readings: Readings
     descriptions: Descriptions
     command: jax.Array  # [3] vx, vy m/s and yaw rate rad/s
-    keep_nominal: jax.Array  # [J] 0/1
+    keep_nominal: jax.Array  # [J] 1 for joints that should, at this command
     actions: jax.Array  # [3, J] this action, the last and the one before
     contact: jax.Array  # [F] 0/1
     air_time: jax.Array  # [F] s, before this step

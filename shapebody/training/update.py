@@ -164,8 +164,8 @@ def prepare(config: TrainConfig, learner: Learner, trajectory: Trajectory):
     )
     # Densities under π_old, and importance weights.
     if config.learn_policy:
-        center = learned_policy(learner) if config.average_proximal else learner.policy
-        mean, std = mapped(lambda x: apply_at_steps(policy, center, *x), inputs, chunks)
+        old = learned_policy(learner) if config.average_proximal else learner.policy
+        mean, std = mapped(lambda x: apply_at_steps(policy, old, *x), inputs, chunks)
         proximal = log_prob(mean, std, batch.action, descriptions.joint_mask[:, :1])
         importance = losses.importance_weight(proximal, by_env(trajectory.extra))
         batch = replace(batch, proximal=proximal, importance=importance)
@@ -295,6 +295,7 @@ def gradient_steps(config: TrainConfig, learner: Learner, batch: Batch, rows, ra
 
 def gradient_step(config: TrainConfig, learner: Learner, batch: Batch, rate, stopped):
     """One step of critic and policy on a minibatch: (Learner, whether to stop, metrics)."""
+    # The critic, towards its targets.
     chunks = number_of_chunks(*batch.valid.shape)
     both = batch, losses.step_weights(batch.valid)
     loss, gradient = summed(
@@ -306,6 +307,7 @@ def gradient_step(config: TrainConfig, learner: Learner, batch: Batch, rate, sto
     )
     critic, state = descend(config, learner.critic, learner.critic_optimizer, gradient, rate)
     metrics = {"value_loss": loss, "updates": jnp.ones(())}
+    # The policy, unless it is frozen (policy evaluation).
     policy, policy_state = learner.policy, learner.policy_optimizer
     if config.learn_policy:
         (_, more), gradient = summed(
