@@ -198,6 +198,11 @@ UNCHECKED |= {
     "training.yardstick.Measured": RESULT,
     "training.yardstick.curve_columns": "called by `Trainer.run`",
     "training.yardstick.due": "called by `Trainer.run`",
+    "training.diagnosis.Diagnosis": RESULT,
+    "training.diagnosis.Diagnosis.sentence": "takes nothing",
+    "training.progress.Progress.note": "called by `Trainer.run`",
+    "training.rollout.require_state_bank": "a check itself, called by `Trainer`",
+    "training.trainer.Trainer.diagnosis": "takes nothing",
     "training.update.require_variables": "a check itself, called by `init_learner`",
 }
 UNCHECKED |= dict.fromkeys(
@@ -850,6 +855,12 @@ FUNCTIONS = {
         robots=ROBOT,
         coefficient=PROBABILITY,
         bodies=integer(1, 2**20),
+        engine=ENGINE,
+    ),
+    "training.diagnosis.diagnose": dict(
+        config=config("networks.config", "PolicyConfig"),
+        policy=thing(lambda world: world.agent.policy),
+        robot=ROBOT,
         engine=ENGINE,
     ),
     "training.policy_evaluation.train_critic": dict(

@@ -4,6 +4,7 @@ import math
 import os
 import sys
 import time
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -12,6 +13,7 @@ from tqdm import tqdm
 from shapebody.files import atomic_write, curve_text, names_path
 from shapebody.stored import read_text
 from shapebody.task.trajectory import Trajectory
+from shapebody.training.diagnosis import Diagnosis
 from shapebody.training.run_state import ANEW
 
 # ---------------------------------------------------------------------- the learning curve
@@ -191,6 +193,7 @@ class Progress:
         self.last, self.until, self.active = last, until, active
         self.first = None  # steps after the first iteration, and when that was
         self.bar = None
+        self.walks = False
 
     def __enter__(self) -> "Progress":
         return self
@@ -210,6 +213,14 @@ class Progress:
             return
         self.bar.set_description_str(self._text(steps, curve.latest), refresh=False)
         self.bar.update(steps - self.bar.n)
+
+    def note(self, diagnosis: Callable[[], Diagnosis | None]) -> None:
+        """Show what a run has come to on a line of its own, until the robot walks."""
+        if self.active and not self.walks:
+            found = diagnosis()
+            if found is not None:
+                tqdm.write(found.sentence(), file=sys.stdout)
+                self.walks = found.finding == "walks"
 
     def _text(self, steps: int, row: dict) -> str:
         text = f"{steps:,} steps  no episode has ended yet"

@@ -13,8 +13,10 @@ import numpy as np
 
 from shapebody.arguments import require_flag, require_kind
 from shapebody.networks.policy import Policy, log_prob
+from shapebody.stored import ARRAYS_LIMIT
 from shapebody.task.env import Locomotion
 from shapebody.task.trajectory import Trajectory
+from shapebody.training.config import TrainConfig
 
 
 def make_policy_function(policy: Policy, mean_actions: bool = False):
@@ -190,3 +192,13 @@ def collect_states(
         return None
     bank = jax.tree.map(lambda *x: np.concatenate(x)[:count].astype(np.float32), *parts)
     return bank, np.concatenate(robots)[:count].astype(np.int32)
+
+
+def require_state_bank(config: TrainConfig, sizes) -> None:
+    """ValueError before the training if its states could not be saved at the end."""
+    most = ARRAYS_LIMIT // (4 * (4 * sizes.joints + 3 * sizes.feet + 32))
+    if config.state_bank > most:
+        raise ValueError(
+            f"state_bank is {config.state_bank}; expected at most {most:,} for these robots, as "
+            "many as fit the file of an agent"
+        )

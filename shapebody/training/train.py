@@ -175,6 +175,8 @@ def _train(
         run_or_interrupt(trainer, progress, max_steps, max_seconds)
         if trainer.steps > begun:
             trainer.save_portable()
+            if progress and (finding := trainer.diagnosis()) is not None:
+                print(finding.sentence(), flush=True)
         if state_only:
             return None
         if not replace and trainer.steps == begun <= (steps_in(trainer.folder) or 0):

@@ -28,12 +28,18 @@ from shapebody.networks.inputs import initialize, standardization
 from shapebody.networks.policy import Policy
 from shapebody.robot.robot import load_robot
 from shapebody.runtime import keep_memory
-from shapebody.stored import ARRAYS_LIMIT
 from shapebody.task.env import Locomotion
 from shapebody.training.config import MOST_STEPS, TrainConfig, located
+from shapebody.training.diagnosis import TELLS_FROM, Diagnosis, diagnose
 from shapebody.training.portable import load_portable, save_portable
 from shapebody.training.progress import CURVE_INTERVAL, Curve, Progress, read_rows
-from shapebody.training.rollout import Actor, Failures, collect_states, make_policy_function
+from shapebody.training.rollout import (
+    Actor,
+    Failures,
+    collect_states,
+    make_policy_function,
+    require_state_bank,
+)
 from shapebody.training.run_state import (
     CURVE,
     PHASES,
@@ -94,7 +100,7 @@ class Trainer:
             task = replace(task, fixed_coefficient=True)
         engine = run_engine(self.folder, engine)
         self.env = Locomotion(robots, config.num_envs, engine=engine, config=task)
-        _check_state_bank(config, self.env.sizes)
+        require_state_bank(config, self.env.sizes)
 
         # Networks, and the learner and actor that use them.
         self.policy, self.critic = Policy(config.policy), Critic(config.critic)
@@ -308,6 +314,16 @@ class Trainer:
             seed=config.seed,
         )
 
+    def diagnosis(self) -> Diagnosis | None:
+        """Whether the robot walks, only stands or falls so far.
+
+        None before 1 million steps, and for a run of several robots.
+        """
+        if len(self.env.robots) > 1 or self.steps < TELLS_FROM:
+            return None
+        policy = self.config.policy, learned_policy(self.learner)
+        return diagnose(*policy, self.env.robots[0], self.env.engine)
+
     # -------------------------------------------------------------- the loop
 
     def last_iteration(self, max_steps=None) -> int:
@@ -357,6 +373,7 @@ class Trainer:
                         if due(self.config.yardstick_interval, self.steps, per_row * batch):
                             policy = self.config.policy, learned_policy(self.learner)
                             measured = curve_columns(*policy, self.env.robots, self.env.engine)
+                            report.note(self.diagnosis)
                         # The yardstick takes time, but does not slow down the training itself.
                         mark = time.monotonic()
                         self.seconds += mark - now
@@ -381,13 +398,3 @@ class Trainer:
             actor.begin(self.learner.policy, number + 1)
         actor.wait()
         return metrics
-
-
-def _check_state_bank(config: TrainConfig, sizes) -> None:
-    """ValueError before the training if its states could not be saved at the end."""
-    most = ARRAYS_LIMIT // (4 * (4 * sizes.joints + 3 * sizes.feet + 32))
-    if config.state_bank > most:
-        raise ValueError(
-            f"state_bank is {config.state_bank}; expected at most {most:,} for these robots, as "
-            "many as fit the file of an agent"
-        )
