@@ -200,7 +200,6 @@ UNCHECKED |= {
     "training.yardstick.due": "called by `Trainer.run`",
     "training.diagnosis.Diagnosis": RESULT,
     "training.diagnosis.Diagnosis.sentence": "takes nothing",
-    "training.progress.Progress.note": "called by `Trainer.run`",
     "training.rollout.require_state_bank": "a check itself, called by `Trainer`",
     "training.trainer.Trainer.diagnosis": "takes nothing",
     "training.update.require_variables": "a check itself, called by `init_learner`",
