@@ -14,7 +14,7 @@ unexport PYTHONHOME
 # The kernel of this environment wins over one in the home folder.
 export JUPYTER_PREFER_ENV_PATH := 1
 
-.PHONY: help venv demo lab test notebooks lint bench lock clean
+.PHONY: help venv demo lab test notebooks studies lint bench lock clean
 
 help:
 	@echo "make demo        create $(VENV) from environment.lock and design a better Go2, in minutes"
@@ -22,6 +22,7 @@ help:
 	@echo "make test        create the same, run the unit tests and every notebook at scale smoke"
 	@echo "make venv        only create $(VENV)"
 	@echo "make notebooks   execute and save all notebooks   (SCALE=smoke|reduced|full, NOTEBOOKS=...)"
+	@echo "make studies     compute those results in data/results again whose agent is no longer shipped"
 	@echo "make lint        check style with ruff"
 	@echo "make bench       run the benchmarks"
 	@echo "make lock        write environment.lock anew from pyproject.toml (needs uv)"
@@ -52,6 +53,9 @@ test: venv
 
 notebooks: venv
 	SHAPEBODY_SCALE=$(SCALE) $(PY) -m tools.notebooks $(NOTEBOOKS)
+
+studies: venv
+	$(PY) -m tools.studies
 
 lint: venv
 	$(PY) -m ruff check .

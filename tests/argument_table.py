@@ -1019,6 +1019,7 @@ FUNCTIONS = {
         agent=AGENT,
         folder=optional(thing(lambda world: world.folder)),
         bodies=integer(1, 10**6),
+        recompute=FLAG,
     ),
     "reproduction.value_studies.size_share": dict(
         agent=AGENT,

@@ -31,6 +31,7 @@ from shapebody.reproduction.design_study import (
 )
 from shapebody.robot.robot import load_robot
 from shapebody.task.config import TaskConfig
+from tools import studies
 
 RUNS = (PENALTY_ONLY, Run("vgds", 20.0), Run("cem"), Run("vgds", 100.0, "reference"))
 SETTING = dict(starts=2, episodes=3, horizon=12, iterations=2)
@@ -462,3 +463,33 @@ def test_policies_are_measured_on_the_yardstick(results, agent, robot, tmp_path)
     other = dataclasses.replace(agent, policy=jax.tree.map(lambda x: 2 * x, agent.policy))
     with pytest.raises(ValueError, match="other settings"):
         value_studies.policy_yardstick(robot, other, bodies=3)
+    again = value_studies.policy_yardstick(robot, other, bodies=3, recompute=True)
+    assert again["records"][2:] == both["records"][2:] and again["records"] != both["records"]
+
+
+def test_a_study_is_stale_with_another_agent(results, agent, robot, monkeypatch, capsys):
+    computed = []
+
+    def study(of, parts=("one", "two")):
+        def compute(recompute, stored):
+            computed.append((of.hash, recompute))
+            wanted = {part: (lambda: [{"x": 1}]) for part in parts}
+            reproduction_results.result_in_parts("trial", wanted, of, recompute, **(stored or kept))
+
+        return studies.Study("trial", ("one", "two"), None, of, compute)
+
+    kept = {"starts": 3}
+    other = dataclasses.replace(agent, policy=jax.tree.map(lambda x: 2 * x, agent.policy))
+    assert study(agent).state() == "missing"
+    study(agent, ("one",)).compute(False, {})
+    assert study(agent).state() == "incomplete" and study(agent).stored() == kept
+    monkeypatch.setattr(studies, "studies", lambda name: [study(agent)])
+    for _ in range(2):  # the second time nothing is left
+        studies.main(("some robot",))
+    assert study(agent).state() == "current" and len(computed) == 2
+    assert study(other).state() == "stale"
+    monkeypatch.setattr(studies, "studies", lambda name: [study(other)])
+    studies.main(("some robot",), list=True)
+    assert "trial: stale" in capsys.readouterr().out and len(computed) == 2
+    studies.main(("some robot",))
+    assert computed[-1] == (other.hash, True) and study(other).state() == "current"

@@ -165,7 +165,9 @@ def published_policy(robot, agent, folder=None, starts: int = 10, episodes: int 
     return result(name, compute, recompute=True, starts=starts, episodes=episodes)
 
 
-def policy_yardstick(robot, agent, folder=None, bodies: int = BODIES) -> dict:
+def policy_yardstick(
+    robot, agent, folder=None, bodies: int = BODIES, recompute: bool = False
+) -> dict:
     """The yardstick of an agent's policy and, where it is at hand, of the authors' published one.
 
     Args:
@@ -174,6 +176,7 @@ def policy_yardstick(robot, agent, folder=None, bodies: int = BODIES) -> dict:
         folder: with the authors' files (`load_published_policy`). If it is not given, the stored
             records of their policy are added, if there are any.
         bodies: number B of bodies.
+        recompute: measure the agent's policy again, and the authors' if `folder` is given.
 
     Returns:
         {"records": ..., "provenance": ...} with a record per policy ("shipped", "published") and
@@ -182,6 +185,7 @@ def policy_yardstick(robot, agent, folder=None, bodies: int = BODIES) -> dict:
     require_robot(robot)
     require_agent(agent)
     require_counts(bodies=bodies)
+    require_flag("recompute", recompute)
     # Read before anything is measured.
     theirs = None if folder is None else load_published_policy(folder, robot.name)
 
@@ -207,6 +211,9 @@ def policy_yardstick(robot, agent, folder=None, bodies: int = BODIES) -> dict:
     name = f"yardstick_{robot.name}"
     parts = {"shipped": lambda: measured("shipped", agent.policy_config, agent.policy)}
     settings = {"shipped": {"policy": agent.policy_hash}}
+    if recompute:
+        again = parts if theirs is None else {**parts, "published": published}
+        result_in_parts(name, again, recompute=True, settings=settings, bodies=bodies)
     if theirs is not None or "published" in stored_parts(name, bodies=bodies):
         parts["published"] = published
     return result_in_parts(name, parts, settings=settings, bodies=bodies)
