@@ -38,16 +38,24 @@ def _run(words: list[str]) -> int:
         os.environ["XLA_FLAGS"] = f"{os.environ.get('XLA_FLAGS', '')} {_FLAG}".strip()
     try:
         command, words = COMMANDS[name](words)
-        prog = f"python -m shapebody {name}"
+        prog = f"python -m shapebody {name}" + " ROBOT [ROBOT ...]" * (name == "train")
         return tyro.cli(command, prog=prog, args=words) or 0
     except BrokenPipeError:
         raise
     except (ValueError, OSError, ImportError) as error:
-        print(f"shapebody: {error}", file=sys.stderr)
+        print(f"shapebody: {_with_option(str(error), words)}", file=sys.stderr)
         return 1
     except KeyboardInterrupt:
         print("shapebody: interrupted", file=sys.stderr)
         return 130
+
+
+def _with_option(message: str, words: list[str]) -> str:
+    """A message such as "trust_region is -1; ..." with the name of the option that was typed."""
+    name, space, rest = message.partition(" ")
+    option = f"--{name.replace('_', '-')}"
+    typed = any(word == option or word.startswith(f"{option}=") for word in words)
+    return option + space + rest if typed and rest.startswith("is ") else message
 
 
 def _usage(commands) -> str:

@@ -38,9 +38,11 @@ def _train(words):
         replace: bool = False,
         engine: Engine = "auto",
     ):
-        """Train an agent: python -m shapebody train ROBOT [ROBOT ...] [--scale reduced] ...
+        """Train an agent on a robot, or on several that share the environments.
 
-        A run that is in the agent's folder already is continued if its settings are the same.
+        ROBOT is a name in data/robots, or an MJCF or URDF file. A run that is in the agent's folder
+        already is continued if its settings are the same. The first options are of this call, the
+        others are settings of the run: of PPO, then of the policy, the critic and the task.
 
         Args:
             settings: of the run.
@@ -208,10 +210,10 @@ def _design(words):
             agent: name in data/checkpoints, or a folder; the agent named as the robot if not given.
             method: vgds, or another name of shapebody.METHODS.
             start: number of a start design; the reference if not given.
-            seed: seed of the random numbers of the search.
+            seed: of the search.
             trust_region: the weight λ of the soft trust region.
-            freeze: parameters that stay as they are: size is the scale of the whole body. Alone,
-                without a name, it frees all, as in the paper.
+            freeze: parameters that stay as they are, such as size (the scale of the whole body),
+                mass or Trunk; none frees all, as in the paper.
             out: write the found body to this MJCF file.
         """
         return _search(robot, settings, agent, method, start, seed, trust_region, freeze, out)
@@ -221,16 +223,17 @@ def _design(words):
 
 
 def _search(robot, settings, agent, method, start, seed, trust_region, freeze, out):
-    import numpy as np
-
     from shapebody.agent.store import load_agent
-    from shapebody.analysis.advice import large_changes
+    from shapebody.analysis.advice import changes, large_changes
     from shapebody.design.space import DesignSpace
     from shapebody.files import atomic_write
     from shapebody.optimizers.objective import Objective
     from shapebody.optimizers.search import search
     from shapebody.robot.robot import load_robot
 
+    if start is not None:
+        require_integer("--start", start, 0)
+    freeze = () if freeze == ("none",) else freeze
     robot = load_robot(robot)
     _check_out(out, robot)
     agent = load_agent(robot.name if agent is None else agent)
@@ -243,9 +246,7 @@ def _search(robot, settings, agent, method, start, seed, trust_region, freeze, o
     print(f"frozen: {', '.join(freeze) or 'nothing'}")
     objective = Objective.of(agent, robot, trust_region, frozen=freeze)
     print(f"objective {float(objective(f[None])[0]):.2f} -> {found.objective:.2f}")
-    for label, index in space.groups.items():
-        change = float(np.sqrt(np.mean(found.design[index] ** 2)))
-        print(f"  {label:32s} RMS change from the reference {change:.3f}")
+    print(changes(space, found.design))
     for change in large_changes(space, found.design):
         print(f"shapebody: warning: another robot: {change}", file=sys.stderr)
     if out:
@@ -375,7 +376,10 @@ def _check_out(out, robot) -> None:
             f"--out is {out}, the file of the robot itself, whose reference body would be lost; "
             "give another name"
         )
-    Path(path).absolute().parent.mkdir(parents=True, exist_ok=True)
+    folder = Path(path).absolute().parent
+    if not folder.is_dir():
+        folder.mkdir(parents=True)
+        print(f"made the folder {folder}")
 
 
 def _warn_of_another_robot(agent, robot) -> None:

@@ -355,6 +355,8 @@ TASK_FIELDS |= dict.fromkeys(
 )
 
 FUNCTIONS = {
+    "analysis.advice.whole_body": dict(space=SPACE, f=DESIGN),
+    "analysis.advice.changes": dict(space=SPACE, f=DESIGN, groups=integer(1, 10**6)),
     "analysis.advice.large_changes": dict(space=SPACE, f=DESIGN, limit=AT_LEAST_0),
     "analysis.advice.objections": dict(
         walked=thing(lambda world: world.evaluation),

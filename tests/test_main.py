@@ -1,6 +1,7 @@
 """The command line: what reaches the functions behind it, and what is said of errors."""
 
 import dataclasses
+import re
 import sys
 from dataclasses import replace
 from pathlib import Path
@@ -90,8 +91,35 @@ def test_design_looks_at_its_output_before_it_searches(files, monkeypatch, tmp_p
     assert "the file of the robot itself" in capsys.readouterr().err
     assert main(["design", robot, "--agent", agent, "--out", str(tmp_path)]) == 1
     assert "a folder" in capsys.readouterr().err
-    assert main(["design", robot, "--agent", agent, "--start", "-1"]) == 1
-    assert "start design is -1; expected an integer of at least 0" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    "option, value", [("--start", "-1"), ("--trust-region", "-2.0"), ("--iterations", "0")]
+)
+def test_errors_name_the_option(files, capsys, option, value):
+    robot, agent = files
+    assert main(["design", robot, "--agent", agent, option, value]) == 1
+    assert capsys.readouterr().err.startswith(f"shapebody: {option} is {value}; expected ")
+    assert main(["design", robot, "--agent", agent, "--freeze", "Size"]) == 1
+    assert "did you mean size" in capsys.readouterr().err
+
+
+def test_an_unknown_robot_is_refused_before_anything_is_announced(capsys):
+    assert main(["train", "unitree_go22"]) == 1
+    captured = capsys.readouterr()
+    assert not captured.out and "Did you mean 'unitree_go2'" in captured.err
+
+
+def test_design_shows_the_body_and_what_changed_most(files, tmp_path, capsys):
+    robot, agent = files
+    out = tmp_path / "new folder" / "body.xml"
+    options = ["--method", "random", "--freeze", "none", "--out", str(out)]
+    assert main(["design", robot, "--agent", agent, *options]) == 0
+    text = capsys.readouterr().out
+    assert "frozen: nothing" in text and f"made the folder {out.parent}" in text
+    assert re.search(r"  mass +\d\S* -> \d\S* kg\n", text) and out.exists()
+    changed = re.findall(r"  (?:\S.*\S) +(0\.\d{3})\n", text)
+    assert len(changed) == 8 and changed == sorted(changed, reverse=True)
 
 
 def test_another_file_of_the_robot_is_named(files, tmp_path, capsys):

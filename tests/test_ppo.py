@@ -274,6 +274,21 @@ def test_an_interrupt_saves_an_agent_only_after_an_iteration(config, tmp_path, m
     assert agent.metadata["steps"] == 384
 
 
+def test_an_interrupt_of_the_last_step_says_what_is_saved(config, tmp_path, monkeypatch, capsys):
+    def interrupt(trainer, folder=None):
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as context:
+        context.setattr("shapebody.training.trainer.Trainer.save_agent", interrupt)
+        with pytest.raises(KeyboardInterrupt):
+            train.train(config, tmp_path, max_steps=config.batch)
+    assert "the run is saved, the agent is not: the same call saves it" in capsys.readouterr().out
+    assert (
+        train.train(config, tmp_path, False, max_steps=config.batch).metadata["steps"]
+        == config.batch
+    )
+
+
 def test_an_agent_is_not_replaced_by_one_with_fewer_steps(config, tmp_path):
     config = replace(config, num_envs=8, minibatch_size=32, epochs=1)
     description = tmp_path / "agent.json"
@@ -747,7 +762,8 @@ def test_progress_counts_from_the_second_iteration(capsys, monkeypatch, terminal
         "8,000 steps  no episode has ended yet  c 0.00  100 steps/s  10:00 left"
     )
     assert ("\r" in out) == terminal
-    assert "02:00 left" in shown(68_000, 460)
+    timed = shown(68_000, 460)
+    assert "02:00 left" in timed and ("25%" in timed) == terminal  # of the time, not of the steps
     assert "00:00 left" in shown(68_000, 0)
     lines = shown(68_000, math.inf).strip().splitlines()
     assert terminal or len(lines) == 2  # at most one a minute, and one at the end

@@ -13,30 +13,59 @@ LARGE_CHANGE = 0.2
 """Share by which mass or a length may change before the body counts as another robot."""
 
 
-def large_changes(space: DesignSpace, f, limit: float = LARGE_CHANGE) -> list[str]:
-    """One sentence per property of the whole body that design f [d] changes by more than `limit`.
+def whole_body(space: DesignSpace, f) -> dict[str, tuple[float, float, str]]:
+    """What changes of the whole body with design f [d]: name -> (reference, design, unit).
 
-    The properties are the total mass (kg), the height of the IMU (m) and the three dimensions (m)
-    in the nominal pose; `limit` is a share of the reference's value.
+    Total mass (kg), the height of the IMU (m) and the three dimensions (m) in the nominal pose.
 
     Raises:
         ValueError: if f is not a design of this space.
     """
     require_kind("space", space, DesignSpace, "shapebody.DesignSpace(robot)")
-    require_number("limit", limit, 0)
     if space.validate(f).ndim != 1:
         raise ValueError(f"design has shape {np.shape(f)}; expected one design [{space.dim}]")
     both = np.stack([space.reference, space.validate(f)])
     told = jax.jit(describe(space.robot))(space(both))
-    values = {"mass, kg": told.total_mass, "height of the IMU, m": told.imu_height}
-    values |= {f"extent in {axis}, m": told.dimensions[:, i] for i, axis in enumerate("xyz")}
+    values = {"mass": (told.total_mass, "kg"), "height of the IMU": (told.imu_height, "m")}
+    values |= {f"extent in {axis}": (told.dimensions[:, i], "m") for i, axis in enumerate("xyz")}
+    return {name: (float(pair[0]), float(pair[1]), unit) for name, (pair, unit) in values.items()}
+
+
+def changes(space: DesignSpace, f, groups: int = 8) -> str:
+    """A text on what design f [d] changes: the whole body, and the groups that change most.
+
+    A group's number is the root mean square of its entries of f: 0 as in the reference, 1 as far as
+    the design space goes.
+
+    Raises:
+        ValueError: if f is not a design of this space.
+    """
+    require_integer("groups", groups, 1)
+    lines = ["the body, reference -> found:"]
+    for name, (before, after, unit) in whole_body(space, f).items():
+        lines.append(f"  {name:32s} {before:.3g} -> {after:.3g} {unit}")
+    f = space.validate(f)
+    size = {name: float(np.sqrt(np.mean(f[i] ** 2))) for name, i in space.groups.items()}
+    most = sorted(size, key=size.get, reverse=True)[:groups]
+    lines.append("what changed most (0: as in the reference, 1: as far as the design space goes):")
+    return "\n".join(lines + [f"  {name:32s} {size[name]:.3f}" for name in most])
+
+
+def large_changes(space: DesignSpace, f, limit: float = LARGE_CHANGE) -> list[str]:
+    """One sentence per property of the whole body that design f [d] changes by more than `limit`.
+
+    The properties are those of `whole_body`; `limit` is a share of the reference's value.
+
+    Raises:
+        ValueError: if f is not a design of this space.
+    """
+    require_number("limit", limit, 0)
     sentences = []
-    for name, (before, after) in values.items():
-        change = float(after / before - 1)
+    for name, (before, after, unit) in whole_body(space, f).items():
+        change = after / before - 1
         if abs(change) > limit:
-            what, unit = name.split(", ")
             sentences.append(
-                f"{what} {before:.3g} {unit} becomes {after:.3g} {unit} ({change:+.0%})"
+                f"{name} {before:.3g} {unit} becomes {after:.3g} {unit} ({change:+.0%})"
             )
     return sentences
 

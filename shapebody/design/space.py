@@ -6,6 +6,7 @@ reference robot. What Φ does is in `phi`.
 
 from __future__ import annotations
 
+import difflib
 import functools
 
 import jax
@@ -183,16 +184,21 @@ class DesignSpace:
                 `groups` ("Torque limit", "Trunk").
 
         Raises:
-            ValueError: for a name that is neither; the known ones are listed.
+            ValueError: for a name that is neither; similar ones are named.
         """
         chosen = np.zeros(self.dim, bool)
         for name in (names,) if isinstance(names, str) else require_list("names", names):
             require_text("a name of parameters", name)
             known = self.slices if name in self.slices else self.groups
             if name not in known:
+                names = [*self.slices, *self.groups]
+                folded = {one.lower(): one for one in names}
+                near = difflib.get_close_matches(name.lower(), folded, 3, 0.6)
+                hint = f"did you mean {' or '.join(folded[one] for one in near)}? " if near else ""
                 raise ValueError(
                     f"there are no parameters {name!r} of robot {self.robot.name!r} to be frozen; "
-                    f"known: {', '.join([*self.slices, *self.groups])}"
+                    f"{hint}expected a key of `slices` ({', '.join(list(self.slices)[:3])}, ...) "
+                    f"or a label of `groups` ({', '.join(list(self.groups)[:3])}, ...)"
                 )
             chosen[known[name]] = True
         return chosen

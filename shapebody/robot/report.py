@@ -334,9 +334,16 @@ def _summary(robot: Robot, held: Held) -> dict[str, str]:
         f"action scale {robot.action_scale:g} rad",
         "torque limits": span(limits, "N m"),
         "velocity limits": span(robot.velocity_limits, "rad/s"),
-        "standing": f"after 1 s sunk by {max(0, held.sunk):.0%}, tilted by "
-        f"{np.degrees(held.tilt):.0f} degrees"
-        if held.finite
-        else "the simulation becomes unstable",
+        "standing": _standing(held),
         "design": f"d = {robot.design_dim} parameters",
     }
+
+
+def _standing(held: Held) -> str:
+    """What became of the robot in its nominal pose, in a few words."""
+    if not held.finite:
+        return "the simulation becomes unstable"
+    tilt = f"tilted by {np.degrees(held.tilt):.0f} degrees"
+    if held.sunk > 1:
+        return f"falls over, {tilt} after 1 s (only feet touch the floor, so the trunk sinks in)"
+    return f"after 1 s sunk by {max(0, held.sunk):.0%}, {tilt}"

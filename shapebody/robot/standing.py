@@ -152,9 +152,10 @@ def warn_standing(robot: Robot, held: Held) -> Iterator[str]:
                 'Go2 among them) and the policy learns to hold it; but check that "home", kp and '
                 "the torque limits are as intended"
             )
+        sunk, tilt = min(held.sunk, 1.0), np.degrees(held.tilt)
         yield (
-            f"it falls out of its nominal pose: within 1 s the trunk sinks by {held.sunk:.0%} of "
-            f"its height and tilts by {np.degrees(held.tilt):.0f} degrees. {cause}"
+            f"it falls out of its nominal pose: within 1 s the trunk sinks by {sunk:.0%} of its "
+            f"height and tilts by {tilt:.0f} degrees. {cause}"
         )
     if held.finite and not held.touching.all():
         feet = listed(robot.model.geom(int(i)).name for i in robot.feet[~held.touching])

@@ -209,10 +209,17 @@ class Progress:
             return
         if self.bar is None:
             self.first = steps, time.monotonic()
-            self.bar = _Bar(self.last, steps, self._text(steps, curve.latest))
+            self.bar = _Bar(self._text(steps, curve.latest))
             return
         self.bar.set_description_str(self._text(steps, curve.latest), refresh=False)
-        self.bar.update(steps - self.bar.n)
+        self.bar.update(self._share(steps) - self.bar.n)
+
+    def _share(self, steps: int) -> float:
+        """What is behind of the budget that ends first, 0 to 1: that of steps or that of time."""
+        first, began = self.first
+        of_steps = (steps - first) / max(self.last - first, 1)
+        of_time = (time.monotonic() - began) / max(self.until - began, 1e-9)
+        return min(max(of_steps, of_time), 1.0)
 
     def note(self, diagnosis: Callable[[], Diagnosis | None]) -> None:
         """Show what a run has come to on a line of its own, until the robot walks."""
@@ -245,15 +252,14 @@ class _Bar(tqdm):
 
     monitor_interval = 0  # no thread of its own, which would print more often
 
-    def __init__(self, total: int, initial: int, text: str):
+    def __init__(self, text: str):
         interactive = sys.stdout.isatty() or "ipykernel" in sys.modules
         super().__init__(
             desc=text,
-            total=total,
-            initial=initial,
+            total=1.0,
             file=sys.stdout if interactive else _Lines(),
             mininterval=1 if interactive else 60,
-            miniters=1,
+            miniters=0,
             maxinterval=math.inf,
             bar_format="{percentage:3.0f}%|{bar:12}| {desc}" if interactive else "{desc}",
             dynamic_ncols=interactive,

@@ -19,8 +19,9 @@ from shapebody.arguments import (
 )
 from shapebody.configuration import from_json
 from shapebody.files import atomic_write
+from shapebody.robot.robot import load_robot
 from shapebody.stored import read_json
-from shapebody.training.config import MOST_STEPS, TrainConfig
+from shapebody.training.config import MOST_STEPS, TrainConfig, located
 from shapebody.training.progress import announce
 from shapebody.training.replacing import require_replaceable, steps_in
 from shapebody.training.run_state import (
@@ -159,6 +160,8 @@ def _train(
         )
     # At once: the trainer, which looks again, takes a while to compile.
     require_own_config(folder, config, tuple(changeable))
+    for robot in config.robots:  # an unknown one is refused before anything is announced
+        load_robot(located(robot))
     announce(engine, len(config.robots), progress)
     trainer = Trainer(config, folder, engine)
     # From reading the state to saving the agent: what another call has written meanwhile would be
@@ -181,7 +184,12 @@ def _train(
             return None
         if not replace and trainer.steps == begun <= (steps_in(trainer.folder) or 0):
             return load_agent(trainer.folder)
-        return trainer.save_agent()
+        try:
+            return trainer.save_agent()
+        except KeyboardInterrupt:
+            if progress:
+                print("\ninterrupted: the run is saved, the agent is not: the same call saves it")
+            raise
 
 
 def run_or_interrupt(trainer: Trainer, progress, max_steps=None, max_seconds=None) -> None:
