@@ -106,6 +106,15 @@ ON_MODEL = "one of the checks of a compiled model, called by `robot.robot.examin
 UNCHECKED = {
     "agent.agent.Agent": "looked at by `check_agent`, which saving and loading call",
     "design.descriptions.Descriptions": RESULT,
+    "design.mirror.Mirrored": RESULT,
+    "design.mirror.mirrored": FORMULA,
+    "design.mirror.reversed_joints": FORMULA,
+    "design.nominal_pose.Pose": RESULT,
+    "design.nominal_pose.Pose.relative": FORMULA,
+    "design.nominal_pose.nominal_pose": "called by `describe`, which looks at the robot",
+    "training.chunks.mapped": "called by `training.update`",
+    "training.chunks.number_of_chunks": "called by `training.update`",
+    "training.chunks.summed": "called by `training.update`",
     "design.descriptions.Normalizer": "a row of NORMALIZERS",
     "design.descriptions.Normalizer.__call__": FORMULA,
     "design.kinematics.Frames": RESULT,
@@ -219,8 +228,7 @@ UNCHECKED |= dict.fromkeys(
         f"training.update.{name}"
         for name in (
             "apply_at_steps constants critic_loss descend gradient_step gradient_steps "
-            "learned_policy learning_rate mapped minibatch_rows number_of_chunks optimizer "
-            "policy_loss prepare summed"
+            "learned_policy learning_rate minibatch_rows optimizer policy_loss prepare"
         ).split()
     ),
     FORMULA,
@@ -410,8 +418,9 @@ FUNCTIONS = {
     ),
     "design.descriptions.Sizes.of": dict(robots=ROBOT),
     "design.descriptions.describe": dict(
-        robot=ROBOT, sizes=optional(thing(lambda world: world.agent.sizes))
+        robot=ROBOT, sizes=optional(thing(lambda world: world.agent.sizes)), mirror=FLAG
     ),
+    "design.mirror.mirror_signs": dict(robot=ROBOT),
     "design.kinematics.kinematics": dict(robot=ROBOT),
     "design.descriptions.symmetric_feet": dict(robot=ROBOT),
     "design.space.DesignSpace": dict(
@@ -581,6 +590,7 @@ FUNCTIONS = {
         auto_reset=FLAG,
         threads=integer(0, 4096),
         physics_options=optional(thing(lambda world: {})).also("dictionary", why="no options"),
+        mirror=FLAG,
     ),
     "task.env.Locomotion.descriptions": dict(
         robot=integer(0, 0, 0), designs=thing(lambda world: world.space.reference[None])
@@ -775,6 +785,8 @@ FUNCTIONS = {
         entropy_coefficient=AT_LEAST_0,
         max_gradient_norm=POSITIVE,
         average_half_life=optional(POSITIVE),
+        mirror_coefficient=AT_LEAST_0,
+        mirrored_critic=FLAG,
         average_proximal=FLAG,
         kl_threshold=POSITIVE.also("inf", why="no threshold"),
         task=TASK,

@@ -19,7 +19,7 @@ from shapebody.robot.robot import load_robot
 from shapebody.robot.spec_edits import COLLISION_GROUP
 
 ROBOTS = ("unitree_go2", "mit_humanoid", "golem")
-FIELDS = [field.name for field in dataclasses.fields(Descriptions)]
+FIELDS = [field.name for field in dataclasses.fields(Descriptions) if field.name != "mirrored"]
 
 # A leg with a body without joint, a body with two joints, joint anchors away from the body's
 # origin, and a joint without actuator.

@@ -18,6 +18,7 @@ from shapebody.configuration import from_json, to_json
 from shapebody.files import alone_in, data_dir
 from shapebody.networks.config import CriticConfig
 from shapebody.task.observations import Observation
+from shapebody.training import chunks as chunks_of
 from shapebody.training import config as training_config
 from shapebody.training import (
     losses,
@@ -26,7 +27,6 @@ from shapebody.training import (
     rollout,
     run_state,
     train,
-    update,
 )
 from shapebody.training import trainer as training_trainer
 from shapebody.training.update import init_learner, ppo_update
@@ -802,12 +802,12 @@ def test_chunks_change_nothing_but_the_order_of_sums():
         return part["a"].sum(0)
 
     for chunks in (1, 2, 3, 6):
-        mapped = update.mapped(double, x, chunks)
+        mapped = chunks_of.mapped(double, x, chunks)
         np.testing.assert_array_equal(mapped["a"], 2 * x["a"])
         assert mapped["none"].shape == (6, 2, 0)
-        np.testing.assert_allclose(update.summed(total, x, chunks), x["a"].sum(0))
-    assert update.number_of_chunks(256, 32) == 8 and update.number_of_chunks(3, 8) == 1
-    assert update.number_of_chunks(6 * 7, 1024) == 42
+        np.testing.assert_allclose(chunks_of.summed(total, x, chunks), x["a"].sum(0))
+    assert chunks_of.number_of_chunks(256, 32) == 8 and chunks_of.number_of_chunks(3, 8) == 1
+    assert chunks_of.number_of_chunks(6 * 7, 1024) == 42
 
 
 def test_a_robot_without_collision_spheres_learns(tmp_path):
@@ -818,7 +818,7 @@ def test_a_robot_without_collision_spheres_learns(tmp_path):
     config = training_config.TrainConfig.smoke(
         str(tmp_path / "bare.xml"), num_envs=64, rollout_length=32, minibatch_size=2048
     )
-    assert update.number_of_chunks(64, 32) == 2
+    assert chunks_of.number_of_chunks(64, 32) == 2
     trainer = training_trainer.Trainer(config, tmp_path / "run")
     trainer.start()
     trainer.run(max_steps=config.batch, progress=False)

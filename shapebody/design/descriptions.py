@@ -17,9 +17,11 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
-from shapebody.arguments import require_kind
+from shapebody.arguments import require_flag, require_kind
 from shapebody.configuration import configuration, integer
-from shapebody.design.kinematics import body_kinematics, take_columns
+from shapebody.design.kinematics import take_columns
+from shapebody.design.mirror import ROTATION, Mirrored, mirror_signs, reversed_joints
+from shapebody.design.nominal_pose import Pose, nominal_pose
 from shapebody.design.parameters import soft_limits
 from shapebody.design.phi import Embodiment
 from shapebody.robot.robot import Robot, require_robot
@@ -134,6 +136,7 @@ class Descriptions:
     nominal_collisions: jax.Array  # [] number of sphere pairs that overlap at that pose
     dimensions: jax.Array  # [3] m, bounding box at that pose, in the trunk frame
     total_mass: jax.Array  # [] kg
+    mirrored: Mirrored | None = None  # of the mirror image of the body, if asked for
 
 
 def symmetric_feet(robot: Robot) -> np.ndarray:
@@ -157,8 +160,12 @@ def symmetric_feet(robot: Robot) -> np.ndarray:
     return pairs
 
 
-def describe(robot: Robot, sizes: Sizes | None = None) -> Callable[[Embodiment], Descriptions]:
+def describe(
+    robot: Robot, sizes: Sizes | None = None, mirror: bool = False
+) -> Callable[[Embodiment], Descriptions]:
     """A function embodiment -> `Descriptions`, padded to `sizes` (default: those of the robot).
+
+    With `mirror`, they also hold the descriptions of the mirror image of the body (`mirror`).
 
     It takes embodiments with any leading axes, and can be jitted, vmapped and differentiated.
     Padding changes no other number.
@@ -167,7 +174,8 @@ def describe(robot: Robot, sizes: Sizes | None = None) -> Callable[[Embodiment],
         ValueError: if `sizes` are smaller than the robot's.
     """
     sizes = _fitting(sizes, robot)
-    at_nominal = _nominal_pose(robot)
+    require_flag("mirror", mirror)
+    at_nominal = nominal_pose(robot)
     # What does not depend on the design, in NumPy so that it works inside a trace.
     joint_mask = _padded_constant(np.ones(robot.num_actuators), sizes.joints)
     foot_mask = _padded_constant(np.ones(robot.num_feet), sizes.feet)
@@ -177,26 +185,27 @@ def describe(robot: Robot, sizes: Sizes | None = None) -> Callable[[Embodiment],
     foot_pairs = _padded_constant(symmetric_feet(robot), sizes.feet, axes=2)
     home_quat = robot.home[3:7] / np.linalg.norm(robot.home[3:7])
     up = constant_matrices(home_quat[None])[2, :, 0]  # vertical axis in the trunk frame
+    sign = _padded_constant(mirror_signs(robot), sizes.joints)
 
     def single(embodiment: Embodiment) -> Descriptions:
         e = embodiment
         pose = at_nominal(e)
-        bodies = _body_rows(e, pose)
-        trunk = bodies[:, robot.trunk]
         total_mass = jnp.sum(e.body_mass[1:])
-        whole = _whole(e, total_mass, pose.dimensions)
         joint_range = take_columns(e.jnt_range.T, robot.joints[robot.actuated])
-        joints = _joint_rows(robot, e, pose, bodies, whole, joint_range)
-        feet = _foot_rows(robot, pose, bodies, whole)
+        joints, feet, static = vectors(e, pose, total_mass, joint_range)
+        image = None
+        if mirror:
+            their_joints, *others = vectors(e, at_nominal(e, True), total_mass, joint_range, True)
+            image = Mirrored(jnp.asarray(sign), reversed_joints(their_joints, sign), *others)
         # Sums instead of products of matrices, which accelerators round to fewer digits.
         home_height = -jnp.min(jnp.sum(up[:, None] * pose.feet, axis=0))
         imu_height = home_height + jnp.sum(up * e.site_pos[robot.imu_site])
         return Descriptions(
-            joints=_padded(joints.T, sizes.joints),
+            joints=joints,
             joint_mask=jnp.asarray(joint_mask),
-            feet=_padded(feet.T, sizes.feet),
+            feet=feet,
             foot_mask=jnp.asarray(foot_mask),
-            static=jnp.concatenate([whole, trunk]),
+            static=static,
             nominal=_padded(e.nominal, sizes.joints),
             action_scale=e.action_scale,
             velocity_limits=_padded(e.velocity_limits, sizes.joints),
@@ -212,6 +221,19 @@ def describe(robot: Robot, sizes: Sizes | None = None) -> Callable[[Embodiment],
             nominal_collisions=_overlapping_pairs(pose.spheres, pose.sphere_radius),
             dimensions=pose.dimensions,
             total_mass=total_mass,
+            mirrored=image,
+        )
+
+    def vectors(e: Embodiment, pose: Pose, total_mass, joint_range, mirror=False):
+        """What the networks see: joints [J, 30], feet [F, 21], static [14]."""
+        bodies = _body_rows(e, pose, mirror)
+        whole = _whole(e, total_mass, pose.dimensions)
+        joints = _joint_rows(robot, e, pose, bodies, whole, joint_range)
+        feet = _foot_rows(robot, pose, bodies, whole)
+        return (
+            _padded(joints.T, sizes.joints),
+            _padded(feet.T, sizes.feet),
+            jnp.concatenate([whole, bodies[:, robot.trunk]]),
         )
 
     def function(embodiment: Embodiment) -> Descriptions:
@@ -236,88 +258,15 @@ def _fitting(sizes: Sizes | None, robot: Robot) -> Sizes:
     return sizes
 
 
-# ------------------------------------------------------------------ the nominal pose
-
-
-class _Pose(NamedTuple):
-    """A design at its nominal pose, in the trunk frame, metres; one column per part."""
-
-    rot: jax.Array  # [3, 3, nbody] of the bodies
-    com: jax.Array  # [3, nbody] their centres of mass
-    anchor: jax.Array  # [3, J] of the actuated joints
-    axis: jax.Array  # [3, J]
-    spheres: jax.Array  # [3, S] centres of the collision spheres
-    sphere_radius: jax.Array  # [S]
-    feet: jax.Array  # [3, F] centres
-    foot_size: jax.Array  # [3, F]
-    low: jax.Array  # [3, 1] corners of the bounding box
-    high: jax.Array  # [3, 1]
-    dimensions: jax.Array  # [3] high - low
-
-    def relative(self, points):
-        """Points [3, n] within the bounding box: from -1 at its lower end to 1 at its upper."""
-        return 2 * (points - self.low) / (self.high - self.low) - 1
-
-
-def _nominal_pose(robot: Robot) -> Callable[[Embodiment], _Pose]:
-    """A function of one embodiment: forward kinematics at its nominal joint positions."""
-    model, forward = robot.model, body_kinematics(robot)
-    boxed = np.concatenate([robot.spheres, robot.feet])
-    boxed_bodies = model.geom_bodyid[boxed]
-    boxed_rot = constant_matrices(model.geom_quat[boxed])
-    # With the trunk at the origin, world coordinates are trunk coordinates.
-    origin = np.array(robot.home, np.float32)
-    origin[:7] = 0, 0, 0, 1, 0, 0, 0
-    # One-hot rows put nominal positions into qpos without a scatter.
-    place = np.zeros((robot.num_actuators, model.nq), np.float32)
-    place[np.arange(robot.num_actuators), robot.qpos_index] = 1
-    not_actuated = origin * (1 - place.sum(axis=0))
-
-    def at_nominal(e: Embodiment) -> _Pose:
-        qpos = not_actuated + jnp.sum(place * e.nominal[:, None], axis=0)
-        pos, rot, anchor, axis = forward(e, qpos)
-        com = pos + rotate(rot, e.body_ipos.T)
-        # A geom reaches as far as its rotated size triple, of which a sphere has only one entry.
-        # This is not its true extent, but what descriptions are made of.
-        box_rot = take_columns(rot, boxed_bodies)
-        local = rotate(box_rot, take_columns(e.geom_pos.T, boxed))
-        center = take_columns(pos, boxed_bodies) + local
-        size = take_columns(e.geom_size.T, boxed)
-        reach = jnp.abs(rotate(box_rot, rotate(boxed_rot, size)))
-        # The bounding box of spheres, feet, actuated joints and centres of mass.
-        anchor, axis = take_columns(anchor, robot.actuated), take_columns(axis, robot.actuated)
-        points = jnp.concatenate([anchor, com[:, 1:]], axis=-1)
-        low = jnp.min(jnp.concatenate([center - reach, points], axis=-1), axis=-1, keepdims=True)
-        high = jnp.max(jnp.concatenate([center + reach, points], axis=-1), axis=-1, keepdims=True)
-        # Without a barrier XLA computes the whole tree again for every number that uses the box.
-        low, high = jax.lax.optimization_barrier((low, high))
-        spheres = slice(None, robot.num_spheres)
-        feet = slice(robot.num_spheres, None)
-        return _Pose(
-            rot=rot,
-            com=com,
-            anchor=anchor,
-            axis=axis,
-            spheres=center[:, spheres],
-            sphere_radius=size[0, spheres],
-            feet=center[:, feet],
-            foot_size=size[:, feet],
-            low=low,
-            high=high,
-            dimensions=(high - low)[:, 0],
-        )
-
-    return at_nominal
-
-
 # ------------------------------------------------------------------ the vectors of Appendix A
 
 
-def _body_rows(e: Embodiment, pose: _Pose):
-    """Mass, centre of mass and inertia of every body: [7, nbody]."""
+def _body_rows(e: Embodiment, pose: Pose, mirror: bool):
+    """Mass, centre of mass and inertia of every body: [7, nbody]; `pose` may be a mirrored one."""
     n = NORMALIZERS
     # Principal moments are rotated like a vector, not like a tensor.
     frames = rotation_matrices(e.body_iquat.T)
+    frames = ROTATION * frames if mirror else frames
     moments = n["inertia"](rotate(pose.rot, rotate(frames, e.body_inertia.T)))
     return jnp.concatenate([n["mass"](e.body_mass[None]), pose.relative(pose.com), moments])
 
@@ -330,7 +279,7 @@ def _whole(e: Embodiment, total_mass, dimensions):
     return jnp.concatenate([jnp.stack(gains), mass, n["dimensions"](dimensions)])
 
 
-def _joint_rows(robot: Robot, e: Embodiment, pose: _Pose, bodies, whole, joint_range):
+def _joint_rows(robot: Robot, e: Embodiment, pose: Pose, bodies, whole, joint_range):
     """Descriptions of the actuated joints, [30, J]."""
     n, model = NORMALIZERS, robot.model
     joints, dofs = robot.joints[robot.actuated], robot.qvel_index
@@ -355,7 +304,7 @@ def _joint_rows(robot: Robot, e: Embodiment, pose: _Pose, bodies, whole, joint_r
     )
 
 
-def _foot_rows(robot: Robot, pose: _Pose, bodies, whole):
+def _foot_rows(robot: Robot, pose: Pose, bodies, whole):
     """Descriptions of the feet, [21, F]."""
     n = NORMALIZERS
     return jnp.concatenate(

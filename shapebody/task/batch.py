@@ -54,13 +54,14 @@ class RobotGroup:
         count: int,
         config: TaskConfig,
         design_dim: int,
+        mirror: bool = False,
     ):
         self.robot, self.physics = robot, physics
         self.first, self.count = first, count
         self.slice = slice(first, first + count)
         self.space = DesignSpace(robot)
         self.read = reader(robot, sizes)
-        self.start = jax.vmap(_starter(robot, self.space, sizes, config, design_dim))
+        self.start = jax.vmap(_starter(robot, self.space, sizes, config, design_dim, mirror))
         self.jitted_start = jax.jit(self.start)
         self.qvel_index = np.asarray(robot.qvel_index)
 
@@ -85,9 +86,9 @@ class RobotGroup:
         return jax.tree.map(lambda *x: np.concatenate(x)[: len(designs)], *parts)
 
 
-def _starter(robot: Robot, space: DesignSpace, sizes: Sizes, config: TaskConfig, design_dim: int):
+def _starter(robot: Robot, space, sizes, config: TaskConfig, design_dim: int, mirror: bool):
     """(key, design[d], coefficient, streak) -> (Episode, Embodiment, qpos, qvel)."""
-    to_descriptions, forward = describe(robot, sizes), kinematics(robot)
+    to_descriptions, forward = describe(robot, sizes, mirror), kinematics(robot)
     home = jnp.asarray(robot.home, jnp.float32)
     site_quat = jnp.asarray(robot.model.site_quat[robot.imu_site], jnp.float32)
     qpos_index = np.asarray(robot.qpos_index)

@@ -51,14 +51,13 @@ class Locomotion:
         robots: a Robot or several; environments are shared out evenly, in order.
         num_envs: size N of the batch.
         engine: "native" (C MuJoCo), "mjx", or "auto": native on a CPU, MJX otherwise.
-        config: the task's settings; by default `TaskConfig()`.
-        sizes: padding; by default the largest of `robots`.
+        config, sizes: the task's settings and the padding; `TaskConfig()`, the largest robot's.
         auto_reset: start a new episode, with a new random design, when one ends.
-            Without it a finished environment goes on: its body moves, rewards still come, and
-            `episode_return` grows. Callers must take note of an environment's first step with
-            `terminated` or `truncated`, ignore what follows, and `reset` or `restart` it.
+            Without it a finished environment goes on and earns. Callers must take note of its first
+            step with `terminated` or `truncated`, ignore what follows, and `reset` or `restart` it.
         threads: physics threads of the native engine, 0 for all cores.
         physics_options: passed on to the engine's constructor.
+        mirror: let descriptions hold those of the mirror image of the body, too (`design.mirror`).
 
     Attributes:
         robots, num_envs, engine, sizes: as given; the engine is "native" or "mjx".
@@ -66,8 +65,8 @@ class Locomotion:
         design_dim: D, the largest robot's d, to which designs are padded.
         physics_state: with MJX one PhysicsState per robot, which `rollout` continues and replaces.
 
-    The function that starts episodes is compiled for each robot, some seconds each; it then holds
-    about 700 memory maps, of the 65,530 that Linux grants a process.
+    The function that starts episodes is compiled for each robot, in seconds; it then holds about
+    700 memory maps, of the 65,530 that Linux grants a process.
 
     Raises:
         ValueError: for an unknown engine, or fewer environments than robots.
@@ -83,9 +82,10 @@ class Locomotion:
         auto_reset: bool = True,
         threads: int = 0,
         physics_options: dict | None = None,
+        mirror: bool = False,
     ):
-        several = isinstance(robots, list | tuple)
-        robots = [require_robot(robot) for robot in (robots if several else [robots])]
+        robots = robots if isinstance(robots, list | tuple) else [robots]
+        robots = [require_robot(robot) for robot in robots]
         engine = resolved(engine)
         if not robots:
             raise ValueError("robots is empty; expected at least one robot")
@@ -97,6 +97,7 @@ class Locomotion:
         sizes = Sizes.of(*robots) if sizes is None else sizes
         require_kind("sizes", sizes, Sizes, "Sizes.of(*robots)")
         require_flag("auto_reset", auto_reset)
+        require_flag("mirror", mirror)
         require_integer("threads", threads, 0, 4096)
         options = {} if physics_options is None else physics_options
         require_kind("physics_options", options, dict, "of arguments of the engine, by name")
@@ -106,8 +107,8 @@ class Locomotion:
         bounds = np.linspace(0, num_envs, len(robots) + 1).astype(int)
         groups = []
         for robot, first, count in zip(robots, bounds, np.diff(bounds), strict=False):
-            physics = simulate(robot, count)
-            groups.append(RobotGroup(robot, physics, sizes, first, count, config, self.design_dim))
+            own = sizes, first, count, config, self.design_dim, mirror
+            groups.append(RobotGroup(robot, simulate(robot, count), *own))
         self.physics_state = None
         self._take(Batch(config, tuple(groups), auto_reset))
 

@@ -4,6 +4,7 @@ from dataclasses import dataclass
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from shapebody.design.descriptions import Descriptions
 from shapebody.rotations import up_axis
@@ -46,6 +47,29 @@ follow the authors' earlier environment."""
 
 LIMIT = 10.0
 """Every observation is clipped to +-this."""
+
+
+_GENERAL = np.array([-1, 1, -1, 1, -1, -1, -1, -1, -1, -1, 1, -1, 1], np.float32)
+_PRIVILEGED = np.array([1, -1, 1, 1, 1], np.float32)
+
+
+def mirrored_observation(observation: Observation, sign) -> Observation:
+    """What the mirror image of a body observes where the body observes this (`design.mirror`).
+
+    Joints that are reversed have the opposite position, velocity and action; the gait clock is half
+    a period later, when left and right have changed their parts.
+
+    Args:
+        sign: [..., J], -1 for reversed joints, of `Descriptions.mirrored`.
+    """
+    joints = observation.joints
+    turned = joints[..., :3] * sign[..., None]
+    return Observation(
+        joints=jnp.concatenate([turned, joints[..., 3:]], -1),
+        feet=observation.feet,
+        general=observation.general * _GENERAL,
+        privileged=observation.privileged * _PRIVILEGED,
+    )
 
 
 def foot_contact(readings: Readings, descriptions: Descriptions):

@@ -109,6 +109,11 @@ class TrainConfig:
     average_proximal: Flag = False
     """Whether the trust region lies around that average (PPO-EWMA, Hilton et al., 2022) instead of
     the policy at the start of the iteration."""
+    mirror_coefficient: NonNegative = 0.0
+    """Weight of the mirror loss: the squared difference, summed over joints, between the action
+    means on a body and the mirrored ones on its mirror image (`design.mirror`). 0: without."""
+    mirrored_critic: Flag = False
+    """Whether the critic learns a random half of each rollout as its mirror image."""
     kl_threshold: Threshold = 0.5
     """The rest of an iteration's updates is skipped once a minibatch exceeds this; inf: never."""
 
@@ -154,6 +159,11 @@ class TrainConfig:
     def batch(self) -> int:
         """Control steps per iteration."""
         return self.num_envs * self.rollout_length
+
+    @property
+    def mirrors(self) -> bool:
+        """Whether something is learned from mirror images."""
+        return self.mirror_coefficient > 0 or self.mirrored_critic
 
     @property
     def iterations(self) -> int:

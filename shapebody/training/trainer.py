@@ -99,7 +99,7 @@ class Trainer:
         if not config.learn_policy:
             task = replace(task, fixed_coefficient=True)
         engine = run_engine(self.folder, engine)
-        self.env = Locomotion(robots, config.num_envs, engine=engine, config=task)
+        self.env = Locomotion(robots, config.num_envs, engine, task, mirror=config.mirrors)
         require_state_bank(config, self.env.sizes)
 
         # Networks, and the learner and actor that use them.

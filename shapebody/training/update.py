@@ -14,10 +14,13 @@ import jax.numpy as jnp
 import optax
 
 from shapebody.arguments import refuse, require_key, require_kind
+from shapebody.design.mirror import mirrored
 from shapebody.networks.critic import Critic
 from shapebody.networks.policy import Policy, log_prob
+from shapebody.task.observations import mirrored_observation
 from shapebody.task.trajectory import Trajectory
 from shapebody.training import losses
+from shapebody.training.chunks import mapped, number_of_chunks, summed
 from shapebody.training.config import TrainConfig
 
 
@@ -48,6 +51,7 @@ class Batch:
     advantage: jax.Array  # normalized
     proximal: jax.Array | None = None  # log density under π_old; None if only the critic learns
     importance: jax.Array | None = None  # min(π_old / μ, 2); None likewise
+    flipped: jax.Array | None = None  # [N] bool, whose mirror images the critic learns, if any
 
 
 def init_learner(config: TrainConfig, policy, critic) -> Learner:
@@ -109,6 +113,9 @@ def ppo_update(config: TrainConfig, learner: Learner, trajectory: Trajectory, ke
 @partial(jax.jit, static_argnums=0)
 def _ppo_update(config, learner, trajectory, key):
     batch, metrics = prepare(config, learner, trajectory)
+    if config.mirrored_critic:
+        flipped = jax.random.bernoulli(jax.random.fold_in(key, 1), shape=(config.num_envs,))
+        batch = replace(batch, flipped=flipped)
     rate = learning_rate(config, learner.iteration)
     rows = minibatch_rows(config, key)
     learner, of_steps = gradient_steps(config, learner, batch, rows, rate)
@@ -200,46 +207,6 @@ def apply_at_steps(network, variables, descriptions, slot, observation):
     )
 
 
-CHUNK = 1024
-"""Control steps whose networks are computed at a time on a CPU: their arrays fit its cache, which
-nearly halves the time of a gradient."""
-
-
-def number_of_chunks(environments: int, length: int) -> int:
-    """In how many equal parts environments of `length` steps are computed, one after the other."""
-    if jax.default_backend() != "cpu":
-        return 1
-    most = min(environments, max(1, environments * length // CHUNK))
-    return next(n for n in range(most, 0, -1) if environments % n == 0)
-
-
-def _chunked(tree, chunks: int):
-    # Not -1 for the number of environments: a robot may have no collision spheres, so no numbers.
-    return jax.tree.map(lambda x: x.reshape((chunks, x.shape[0] // chunks) + x.shape[1:]), tree)
-
-
-def mapped(function, tree, chunks: int):
-    """function(tree) of arrays [N, ...], computed in chunks of environments."""
-    if chunks == 1:
-        return function(tree)
-    result = jax.lax.map(function, _chunked(tree, chunks))
-    return jax.tree.map(lambda x: x.reshape((x.shape[0] * x.shape[1],) + x.shape[2:]), result)
-
-
-def summed(function, tree, chunks: int):
-    """Sum of function(chunk) over chunks of environments of arrays [N, ...]."""
-    if chunks == 1:
-        return function(tree)
-    parts = _chunked(tree, chunks)
-    shapes = jax.eval_shape(function, jax.tree.map(lambda x: x[0], parts))
-    zeros = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shapes)
-
-    def add(total, part):
-        return jax.tree.map(jnp.add, total, function(part)), None
-
-    return jax.lax.scan(add, zeros, parts)[0]
-
-
 def minibatch_rows(config: TrainConfig, key):
     """Environments of every minibatch, int32[epochs x minibatches, environments in each].
 
@@ -275,6 +242,7 @@ def gradient_steps(config: TrainConfig, learner: Learner, batch: Batch, rows, ra
     Once the KL divergence exceeds `config.kl_threshold`, the rest of the iteration is skipped.
     """
     names = ["value_loss", "updates"] + ["kl", "clipped", "std"] * config.learn_policy
+    names += ["mirror"] * (config.learn_policy and config.mirror_coefficient > 0)
 
     def one(carry, rows):
         learner, stopped = carry
@@ -345,7 +313,16 @@ def policy_loss(config: TrainConfig, params, constants, batch: Batch, weight):
         ratio, batch.advantage, batch.importance, weight, config.clip_range
     )
     loss = loss - config.entropy_coefficient * losses.entropy_bonus(std, mask, weight)
-    return loss, {
+    metrics = {}
+    if config.mirror_coefficient > 0:
+        # Both sides are moved: neither of two different actions is known to be the better one.
+        image, sign = mirrored(batch.descriptions), batch.descriptions.mirrored.sign[:, :1]
+        seen = mirrored_observation(batch.observation, sign)
+        there, _ = apply_at_steps(Policy(config.policy), variables, image, batch.slot, seen)
+        defect = jnp.sum(jnp.sum((sign * there - mean) ** 2, -1) * weight)
+        loss = loss + config.mirror_coefficient * defect
+        metrics["mirror"] = defect
+    return loss, metrics | {
         "kl": losses.approximate_kl(ratio, log_ratio, weight),
         "clipped": losses.clipped_share(ratio, weight, config.clip_range),
         "std": jnp.sum(jnp.sum(std * mask, -1) / jnp.sum(mask, -1) * weight),
@@ -355,10 +332,19 @@ def policy_loss(config: TrainConfig, params, constants, batch: Batch, weight):
 def critic_loss(config: TrainConfig, params, constants, batch: Batch, weight):
     """The value loss of the critic's parameters on steps whose weights [N, T] are `weight`."""
     variables = {"params": params, **constants}
-    values = apply_at_steps(
-        Critic(config.critic), variables, batch.descriptions, batch.slot, batch.observation
-    )
+    seen = batch.descriptions, batch.observation
+    if batch.flipped is not None:
+        image = mirrored(batch.descriptions)
+        image = image, mirrored_observation(batch.observation, image.mirrored.sign[:, :1])
+        seen = jax.tree.map(partial(_where, batch.flipped), image, seen)
+    descriptions, observation = seen
+    values = apply_at_steps(Critic(config.critic), variables, descriptions, batch.slot, observation)
     return losses.value_loss(values, batch.target, weight)
+
+
+def _where(chosen, x, y):
+    """x [N, ...] in the environments that `chosen` [N] is true for, y in the others."""
+    return jnp.where(chosen.reshape((-1,) + (1,) * (x.ndim - 1)), x, y)
 
 
 def constants(variables) -> dict:

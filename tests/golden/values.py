@@ -74,7 +74,8 @@ def summarized(values: dict) -> dict:
 
 def named(tree, prefix: str = "") -> dict:
     """Fields of a dataclass of arrays by name."""
-    return {prefix + field.name: np.asarray(getattr(tree, field.name)) for field in fields(tree)}
+    values = {prefix + field.name: getattr(tree, field.name) for field in fields(tree)}
+    return {name: np.asarray(value) for name, value in values.items() if value is not None}
 
 
 def named_leaves(tree, prefix: str) -> dict:
