@@ -17,7 +17,7 @@ from tiny import quick_compilation, tiny_agent, tiny_robot
 from shapebody.agent.description import HASHED, hash_document
 from shapebody.agent.store import agents, load_agent, load_curve, save_agent
 from shapebody.design.descriptions import Descriptions
-from shapebody.files import atomic_write, load_arrays, save_arrays
+from shapebody.files import atomic_write, data_dir, load_arrays, save_arrays
 from shapebody.provenance import provenance
 
 
@@ -412,3 +412,19 @@ def test_leaves_that_cannot_be_written_are_named(tmp_path):
     with pytest.raises(ValueError, match="leaf 'name' is str"):
         save_arrays(tmp_path / "x", {"name": "text"})
     assert not (tmp_path / "x").exists()
+
+
+def test_training_page_states_the_branches():
+    """Each comparison of two branches has its figures in TRAINING.md."""
+    page = (data_dir() / "checkpoints" / "TRAINING.md").read_text().replace("\n", " ")
+    stored = json.loads((data_dir() / "results" / "training_branches.json").read_text())
+    for name, part in stored["parts"].items():
+        begun, old, new = part["records"]
+        steps = ", ".join(f"{one['steps'] / 1e6:.1f}" for one in (old, new))
+        begun, old, success = (f"{100 * one['success_c1']:.0f} %" for one in (begun, old, new))
+        change, low, high = (100 * x for x in new["over_as_before"]["success_c1"])
+        gained = "{:+.1f} [{:+.1f}, {:+.1f}]".format(*new["over_as_before"]["return_c1"])
+        row = (
+            f"| {steps} | {begun} → {old}, {success} | {change:+.0f} % [{low:+.0f}, {high:+.0f}] |"
+        )
+        assert f"{row} {gained} |" in page, f"{name}: TRAINING.md should have {row} {gained} |"
