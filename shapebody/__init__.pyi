@@ -2,6 +2,7 @@
 
 from . import analysis as analysis
 from . import reproduction as reproduction
+from .agent.published import load_published_policy as load_published_policy
 from .agent.store import load_agent as load_agent
 from .agent.store import save_agent as save_agent
 from .design.descriptions import describe as describe

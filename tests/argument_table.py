@@ -208,6 +208,10 @@ UNCHECKED |= {
     "training.yardstick.curve_columns": "called by `Trainer.run`",
     "training.yardstick.due": "called by `Trainer.run`",
     "training.diagnosis.Diagnosis": RESULT,
+    "training.critics.CriticScores": RESULT,
+    "training.critics.CriticsTrainer": "made by `train_critics`",
+    "training.critics.CriticsTrainer.everything": "takes nothing",
+    "agent.agent.require_critic": "a check itself",
     "training.diagnosis.Diagnosis.sentence": "takes nothing",
     "training.rollout.require_state_bank": "a check itself, called by `Trainer`",
     "training.trainer.Trainer.diagnosis": "takes nothing",
@@ -883,8 +887,28 @@ FUNCTIONS = {
         task_of=choice("training"),
         **RESUMED,
     ),
-    "networks.published.load_published_policy": dict(
+    "networks.published.read_published_policy": dict(
         folder=thing(lambda world: world.folder), name=optional(NAME)
+    ),
+    "agent.published.load_published_policy": dict(
+        folder=thing(lambda world: world.folder),
+        name=optional(NAME),
+        robots=optional(thing(lambda world: [world.robot])),
+    ),
+    "training.critics.train_critics": dict(
+        agent=AGENT,
+        critics=thing(lambda world: {"one": world.agent.critic_config}),
+        steps=optional(STEPS),
+        seeds=integer(1, 1000),
+        **RESUMED,
+    ),
+    "training.critics.held_out_scores": dict(
+        agent=AGENT,
+        critics=thing(lambda world: {"one": world.agent}),
+        bodies=integer(1, 100_000),
+        moments=integer(1, 100_000),
+        seed=SEED,
+        engine=ENGINE,
     ),
     "evaluation.recording.record_episode": dict(
         agent=AGENT,

@@ -24,7 +24,7 @@ from shapebody.networks.inputs import (
     standardization,
 )
 from shapebody.networks.policy import Policy, entropy, log_prob
-from shapebody.networks.published import load_published_policy
+from shapebody.networks.published import read_published_policy
 from shapebody.networks.urma import aggregate, elu
 
 # Wide key layers would only slow these tests down; nothing below depends on the sizes.
@@ -568,7 +568,8 @@ def published_actions(layers, descriptions, observation):
 def test_published_policy(tmp_path):
     layers = published_layers()
     write_published(tmp_path, layers)
-    policy, variables = load_published_policy(tmp_path)
+    policy, variables, name = read_published_policy(tmp_path)
+    assert name == "robot"
     merged = sum(array.size for array in layers.values())
     assert count_parameters(variables["params"]) == merged + 20 + 16 + 12 + 10 + LATENT
     inputs = random_inputs(11)
@@ -581,25 +582,25 @@ def test_published_policy(tmp_path):
 
 def test_published_policy_errors(tmp_path):
     with pytest.raises(FileNotFoundError, match=r"no \*\.weights\.json"):
-        load_published_policy(tmp_path)
+        read_published_policy(tmp_path)
     layers = published_layers()
     write_published(tmp_path, layers, "first")
     write_published(tmp_path, layers, "second")
     with pytest.raises(ValueError, match="first, second"):
-        load_published_policy(tmp_path)
-    load_published_policy(tmp_path, "second")
+        read_published_policy(tmp_path)
+    read_published_policy(tmp_path, "second")
     with pytest.raises(FileNotFoundError, match="third"):
-        load_published_policy(tmp_path, "third")
+        read_published_policy(tmp_path, "third")
     numbers = tmp_path / "first.weights.bin"
     numbers.write_bytes(numbers.read_bytes()[:-8])
     with pytest.raises(ValueError, match="fetch both files again"):
-        load_published_policy(tmp_path, "first")
+        read_published_policy(tmp_path, "first")
     write_published(tmp_path, {k: v for k, v in layers.items() if k != "Dense_8.bias"}, "first")
     with pytest.raises(ValueError, match="other layers .*Dense_8.bias"):
-        load_published_policy(tmp_path, "first")
+        read_published_policy(tmp_path, "first")
     write_published(tmp_path, layers | {"Dense_4.kernel": np.zeros((19, 16), "f4")}, "first")
     with pytest.raises(ValueError, match="Dense_4.kernel .* expected 20 rows"):
-        load_published_policy(tmp_path, "first")
+        read_published_policy(tmp_path, "first")
     write_published(tmp_path, layers | {"Dense_4.bias": np.full(16, np.nan, "f4")}, "first")
     with pytest.raises(ValueError, match="not finite"):
-        load_published_policy(tmp_path, "first")
+        read_published_policy(tmp_path, "first")

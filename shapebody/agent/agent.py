@@ -30,8 +30,9 @@ class Agent:
         name: name of the folder in `data/checkpoints`.
         robots: names of the robots it was trained on.
         sizes: numbers of joints, feet and spheres to which everything is padded.
-        policy_config, critic_config: sizes of the networks.
-        policy, critic: variables of the networks, {"params": ..., "constants": ...}.
+        policy_config, critic_config: sizes of the networks; no critic's for an agent without one.
+        policy, critic: variables of the networks, {"params": ..., "constants": ...}; critic None
+            for a policy that has none, which can walk but not judge designs.
         states: the state bank of M states, an Observation with leading axis M, padded to `sizes`,
             float32; None if there is none.
         state_robots: int[M], index into `robots` of the robot that each state comes from.
@@ -43,9 +44,9 @@ class Agent:
     robots: tuple[str, ...]
     sizes: Sizes
     policy_config: PolicyConfig
-    critic_config: CriticConfig
+    critic_config: CriticConfig | None
     policy: Any
-    critic: Any
+    critic: Any | None
     states: Observation | None = None
     state_robots: np.ndarray | None = None
     metadata: dict = field(default_factory=dict)
@@ -65,6 +66,7 @@ class Agent:
 
     def values(self, descriptions: Descriptions, observation: Observation):
         """Values [..., K] of the critic's heads."""
+        require_critic(self)
         require_inputs(descriptions, observation)
         return _values(self.critic_config)(self.critic, descriptions, observation)
 
@@ -112,9 +114,22 @@ def require_agent(agent) -> Agent:
     return require_kind("agent", agent, Agent, "load it with shapebody.load_agent(...)")
 
 
+def require_critic(agent: Agent) -> Agent:
+    """The agent; ValueError if it has no critic."""
+    if require_agent(agent).critic is None:
+        raise ValueError(
+            f"agent {agent.name!r} has no critic, which alone can judge designs; train one by "
+            "policy evaluation: shapebody.training.critics.train_critics"
+        )
+    return agent
+
+
 def flat_weights(agent: Agent) -> dict[str, np.ndarray]:
     """Weights of both networks as float32, by names such as "policy/params/core/layer_0/bias"."""
-    flat = flatten_dict({"policy": agent.policy, "critic": agent.critic}, sep="/")
+    networks = {"policy": agent.policy}
+    if agent.critic is not None:
+        networks["critic"] = agent.critic
+    flat = flatten_dict(networks, sep="/")
     return {name: np.array(flat[name], np.float32, order="C") for name in sorted(flat)}
 
 

@@ -29,7 +29,7 @@ import numpy as np
 import safetensors.numpy
 from flax.traverse_util import flatten_dict, unflatten_dict
 
-from shapebody.agent.agent import Agent, flat_states, flat_weights, hash_arrays, require_agent
+from shapebody.agent.agent import Agent, flat_states, flat_weights, hash_arrays, require_critic
 from shapebody.agent.description import (
     DESCRIPTION,
     Description,
@@ -148,7 +148,7 @@ def save_agent(
 
 def check_agent(agent: Agent) -> None:
     """Raise ValueError if the parts of an agent do not fit together, or are too large."""
-    require_agent(agent)
+    require_critic(agent)
     require_name("the name of the agent", agent.name)
     if not agent.robots:
         raise ValueError(f"agent {agent.name!r} names no robots; give at least one")

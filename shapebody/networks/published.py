@@ -5,11 +5,11 @@ the layers (name, shape, byte offset, size in bytes) and a few hyperparameters; 
 the numbers, little-endian float32. The files are not part of this package.
 """
 
-import json
+import math
 
 import numpy as np
 
-from shapebody.arguments import require_name, require_path
+from shapebody.arguments import require_name, require_path, shown
 from shapebody.networks.config import PolicyConfig
 from shapebody.networks.inputs import (
     GENERAL,
@@ -20,13 +20,14 @@ from shapebody.networks.inputs import (
     identity,
 )
 from shapebody.networks.policy import Policy
+from shapebody.stored import read_json
 
 # Dense_0, Dense_1: key; Dense_2: value; Dense_3 to Dense_7: core; Dense_8: log-std.
 _CORE_LAYERS = 5
 _LAYERS = {f"Dense_{index}" for index in range(_CORE_LAYERS + 4)} | {"LayerNorm_0", "LayerNorm_1"}
 
 
-def load_published_policy(folder, name=None):
+def read_published_policy(folder, name=None):
     """Read one of the authors' policies as a `Policy` of this package.
 
     Inputs need no standardization: descriptions and observations have the authors' divisors.
@@ -39,7 +40,8 @@ def load_published_policy(folder, name=None):
             holds one policy only.
 
     Returns:
-        (policy, variables): `policy.apply(variables, descriptions, observation)` gives (mean, std).
+        (policy, variables, name): `policy.apply(variables, descriptions, observation)` gives
+        (mean, std).
 
     Raises:
         FileNotFoundError: if a file is missing.
@@ -61,19 +63,35 @@ def load_published_policy(folder, name=None):
     for path in (index_file, numbers_file):
         if not path.is_file():
             raise FileNotFoundError(f"{path} is missing; a published policy needs both its files")
-    index = json.loads(index_file.read_text())
-    weights = _read_layers(index["layers"], numbers_file)
+    index = read_json(index_file, "fetch both files again")
+    weights = _read_layers(_layers_of(index, index_file), numbers_file)
     config = _config(weights, index.get("hyperparams", {}), index_file)
-    return Policy(config), {"params": _params(weights), "constants": _identity_constants()}
+    variables = {"params": _params(weights), "constants": _identity_constants()}
+    return Policy(config), variables, name
+
+
+def _layers_of(index, index_file) -> list[tuple[str, tuple[int, ...], int, int]]:
+    """(name, shape, offset, size in bytes) of every layer; ValueError for another format."""
+    kinds = {"name": str, "shape": list, "offset": int, "size_bytes": int}
+    layers = index.get("layers") if isinstance(index, dict) else None
+    found = []
+    for layer in layers if isinstance(layers, list) else [None]:
+        values = [layer.get(key) for key in kinds] if isinstance(layer, dict) else []
+        fits = values and all(map(isinstance, values, kinds.values()))
+        if not fits or not all(isinstance(n, int) and n > 0 for n in values[1]):
+            raise ValueError(
+                f"{index_file} is no published policy: {shown(layer)} among its layers; expected "
+                'a list "layers" of name, shape, offset and size_bytes: fetch both files again'
+            )
+        found.append((values[0], tuple(values[1]), values[2], values[3]))
+    return found
 
 
 def _read_layers(layers, numbers_file):
     numbers = numbers_file.read_bytes()
     weights = {}
-    for layer in layers:
-        name, shape = layer["name"], tuple(layer["shape"])
-        start, size = layer["offset"], layer["size_bytes"]
-        if size != 4 * int(np.prod(shape)) or start < 0 or start + size > len(numbers):
+    for name, shape, start, size in layers:
+        if size != 4 * math.prod(shape) or start < 0 or start + size > len(numbers):
             raise ValueError(
                 f"{name} of shape {shape} should be {size} bytes from byte {start} of "
                 f"{numbers_file}, which has {len(numbers)} bytes; fetch both files again"

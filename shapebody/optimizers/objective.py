@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from shapebody.agent.agent import Agent, require_agent
+from shapebody.agent.agent import Agent, require_critic
 from shapebody.arguments import require_integer, require_key, require_kind, require_number
 from shapebody.design.descriptions import Descriptions, describe
 from shapebody.design.space import DesignSpace
@@ -116,9 +116,10 @@ class Objective:
         Raises:
             TypeError: if `agent` is not an `Agent` or `robot` is not a `Robot`, but a name.
             ValueError: for a λ that is negative or not finite, a wrong reference or batch size,
-                unknown names of parameters, and an agent without states that fit the robot.
+                unknown names of parameters, and an agent without a critic, or without states that
+                fit the robot.
         """
-        require_agent(agent)
+        require_critic(agent)
         hint = "the penalty coefficient, 100 in the paper"
         require_number("trust_region", trust_region, 0, LARGEST_LAMBDA, hint=hint)
         require_integer("batch_size", batch_size, 1)

@@ -9,7 +9,7 @@ from shapebody.arguments import require_flag, require_seed
 from shapebody.design.space import DesignSpace
 from shapebody.evaluation.evaluate import evaluate
 from shapebody.files import data_dir
-from shapebody.networks.published import load_published_policy
+from shapebody.networks.published import read_published_policy
 from shapebody.optimizers.objective import Objective
 from shapebody.optimizers.search import METHODS, search
 from shapebody.reproduction.design_study import evaluation_config, require_counts
@@ -118,7 +118,7 @@ def published_policy(robot, agent, folder=None, starts: int = 10, episodes: int 
     Args:
         robot: the robot of that policy.
         agent: any agent for it; its policy is replaced by the authors'.
-        folder: with the authors' files (`load_published_policy`). If it is not given, the stored
+        folder: with the authors' files (`networks.published`). If it is not given, the stored
             result is returned.
         starts, episodes: start designs, and evaluation episodes per design.
 
@@ -143,7 +143,7 @@ def published_policy(robot, agent, folder=None, starts: int = 10, episodes: int 
         )
 
     def compute():
-        module, variables = load_published_policy(folder, robot.name)
+        module, variables, _ = read_published_policy(folder, robot.name)
         theirs = replace(agent, name="published", policy_config=module.config, policy=variables)
         space = DesignSpace(robot)
         rows = [("reference", None, space.reference)]
@@ -173,7 +173,7 @@ def policy_yardstick(
     Args:
         robot: the robot of both policies.
         agent: whose policy is measured.
-        folder: with the authors' files (`load_published_policy`). If it is not given, the stored
+        folder: with the authors' files (`networks.published`). If it is not given, the stored
             records of their policy are added, if there are any.
         bodies: number B of bodies.
         recompute: measure the agent's policy again, and the authors' if `folder` is given.
@@ -187,7 +187,7 @@ def policy_yardstick(
     require_counts(bodies=bodies)
     require_flag("recompute", recompute)
     # Read before anything is measured.
-    theirs = None if folder is None else load_published_policy(folder, robot.name)
+    theirs = None if folder is None else read_published_policy(folder, robot.name)
 
     def measured(policy, config, variables):
         records = []
@@ -205,7 +205,7 @@ def policy_yardstick(
         return records
 
     def published():
-        module, variables = theirs
+        module, variables, _ = theirs
         return measured("published", module.config, variables)
 
     name = f"yardstick_{robot.name}"

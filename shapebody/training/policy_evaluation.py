@@ -123,15 +123,21 @@ def evaluation_config(
     Raises:
         ValueError: if the agent does not say how its policy was trained.
     """
+    published = "published" in agent.metadata  # nothing is known of its training
     missing = [name for name in ("config", "scale") if name not in agent.metadata]
-    if missing:
+    if missing and not published:
         raise ValueError(
             f"the metadata of agent {agent.name!r} lack {missing[0]!r}, which says how its policy "
             "was trained; restore its agent.json, or train it anew"
         )
-    what = f"metadata of agent {agent.name!r}: config"
-    trained = from_json(TrainConfig, agent.metadata["config"], what)
-    base = TrainConfig.at_scale(agent.metadata["scale"], trained.robots[0], name=agent.name)
+    if published:
+        robots = tuple(agent.metadata["robots"])
+        trained = TrainConfig.reduced(robots[0], robots=robots)
+    else:
+        what = f"metadata of agent {agent.name!r}: config"
+        trained = from_json(TrainConfig, agent.metadata["config"], what)
+    scale = agent.metadata.get("scale", trained.scale)
+    base = TrainConfig.at_scale(scale, trained.robots[0], name=agent.name)
     length = max(base.rollout_length, 32)
     task = TaskConfig.evaluation() if task_of == "evaluation" else trained.task
     settings = {

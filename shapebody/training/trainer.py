@@ -230,7 +230,7 @@ class Trainer:
         if self.known is None:
             self._start_from_portable()
         else:
-            self._start_exactly()
+            self._take(load_arrays(self.folder / STATE, self._as_saved()))
         # An average that is new begins with the policy; one that is no longer wanted goes.
         averages = self.config.average_half_life is not None
         if averages != (self.learner.average is not None):
@@ -238,8 +238,7 @@ class Trainer:
             self.learner = replace(self.learner, average=average)
         return True
 
-    def _start_exactly(self) -> None:
-        saved = load_arrays(self.folder / STATE, self._as_saved())
+    def _take(self, saved: dict) -> None:
         self.learner, self.seconds = saved["learner"], float(saved["seconds"])
         self.actor.resume(saved["behaviour"], saved["state"], saved["physics"])
 
@@ -337,9 +336,7 @@ class Trainer:
         """Train until the configured number of steps, or until a budget is used up.
 
         Args:
-            max_steps: stop once this many steps in all have been consumed.
-            max_seconds: stop after this many seconds of this call.
-            progress: show return, tracking error, curriculum coefficient, speed and time left.
+            max_steps, max_seconds, progress: see `train`.
             curve_interval: iterations per row of the learning curve, CURVE_INTERVAL if not given.
 
         Raises:
@@ -391,10 +388,13 @@ class Trainer:
         if actor.beside:
             # With the policy before the update, so that both work at the same time.
             actor.begin(self.learner.policy, number + 1)
-        key = jax.random.fold_in(self.key, 2 * number + 1)
-        self.learner, metrics = ppo_update(self.config, self.learner, trajectory, key)
-        metrics = {name: float(x) for name, x in metrics.items()}
+        metrics = self._learn(trajectory, number)
         if not actor.beside:
             actor.begin(self.learner.policy, number + 1)
         actor.wait()
         return metrics
+
+    def _learn(self, trajectory, number: int) -> dict[str, float]:
+        key = jax.random.fold_in(self.key, 2 * number + 1)
+        self.learner, metrics = ppo_update(self.config, self.learner, trajectory, key)
+        return {name: float(x) for name, x in metrics.items()}
