@@ -417,6 +417,10 @@ FUNCTIONS = {
         critics=CRITICS, robot=ROBOT, records=RECORDS
     ),
     "reproduction.critic_ablation.critic_gains": dict(records=RECORDS),
+    "reproduction.critic_ablation.variants": {},
+    "reproduction.critic_ablation.critic_ablation": dict(
+        agent=AGENT, critics=CRITICS, robot=ROBOT, progress=FLAG
+    ),
     "design.descriptions.Sizes": dict(
         joints=integer(1, 10**4), feet=integer(1, 10**4), spheres=integer(0, 10**4)
     ),

@@ -13,6 +13,7 @@ from shapebody.agent.store import load_agent, save_agent
 from shapebody.evaluation.evaluate import evaluate
 from shapebody.networks.config import CriticConfig
 from shapebody.optimizers.search import search
+from shapebody.reproduction import critic_ablation
 from shapebody.training.critics import held_out_scores, train_critics
 from shapebody.training.policy_evaluation import train_critic
 
@@ -112,3 +113,26 @@ def test_scores_on_bodies_never_seen(published, robot, monkeypatch):
     assert seen["rows"] == (3, 6, 13)
     assert scores["constant"].explained_variance == pytest.approx(0, abs=1e-6)
     assert scores["constant"].rmse > 0
+
+
+def test_variants_are_those_of_the_paper():
+    names = list(critic_ablation.variants())
+    assert names[0] == "original 1x4" and names[-2] == "direct-design 3x32" and len(names) == 9
+    assert critic_ablation.variants()["original 1x4"].heads == 1
+
+
+def test_ablation_keeps_seeds_apart(published, robot, tmp_path, monkeypatch):
+    monkeypatch.setattr("shapebody.training.critics.AHEAD", 20)
+    monkeypatch.setenv("SHAPEBODY_DATA", str(tmp_path))
+    monkeypatch.setenv("SHAPEBODY_SCALE", "reduced")
+    critics = train_critics(
+        published, {"small": SMALL, "other": OTHER}, tmp_path / "run", 32, 2, False, **RUN
+    )
+    setting = dict(starts=2, episodes=2, horizon=20)
+    study = critic_ablation.critic_ablation(published, critics, robot, **setting)
+    assert study == critic_ablation.critic_ablation(published, critics, robot, **setting)
+    predictions, found = study["records"][:4], study["records"][4:]
+    assert [row["critic"] for row in predictions] == list(critics)
+    assert all(row["parameters"] > 0 and -1 <= row["rho"] <= 1 for row in predictions)
+    gains = critic_ablation.critic_gains(found)
+    assert {row["critic"] for row in gains} == {None, *critics}

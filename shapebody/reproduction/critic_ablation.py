@@ -3,6 +3,8 @@
 All search from the same start designs (Section 4.1), and are compared with penalty only.
 """
 
+from functools import partial
+
 import numpy as np
 
 from shapebody.agent.agent import require_agent
@@ -17,11 +19,15 @@ from shapebody.arguments import (
 from shapebody.design.space import DesignSpace
 from shapebody.evaluation.evaluate import EvaluationConfig, evaluate
 from shapebody.evaluation.statistics import paired_gain, rank_correlation
+from shapebody.networks.config import CriticConfig
+from shapebody.networks.inputs import count_parameters
 from shapebody.optimizers.objective import Objective
 from shapebody.optimizers.search import search
+from shapebody.reproduction import paper
 from shapebody.reproduction.results import result, result_in_parts
 from shapebody.reproduction.value_studies import value_against_return
 from shapebody.task.config import TaskConfig
+from shapebody.training.critics import held_out_scores
 
 
 def compare_critics(
@@ -190,3 +196,77 @@ def critic_tasks(old, new, robot, **changes) -> dict:
     }
     name = f"critic_tasks_{robot.name}"
     return result_in_parts(name, parts, new, **setting, old=old.hash)
+
+
+# ------------------------------------------------------------------ the ablation of Appendix B
+
+
+def variants() -> dict[str, CriticConfig]:
+    """The nine critics of Appendix B at the widths of `reduced`, such as "direct-design 3x32".
+
+    The name has the number of heads and the value latent, which is the same for joints and feet.
+    """
+    return {
+        f"{kind} {heads}x{latent}": CriticConfig.reduced(
+            kind=kind, heads=heads, joint_value_latent=latent, foot_value_latent=latent
+        )
+        for kind, heads, latent, _ in paper.CRITIC_ABLATION
+    }
+
+
+def critic_ablation(agent, critics: dict, robot, progress: bool = False, **changes) -> dict:
+    """What critics of one policy are worth, each trained from several seeds (Appendix B).
+
+    data/results/critic_ablation_<agent>.json is this with `train_critics(agent, variants(), ...,
+    seeds=5)`; the script is tools/ablation.py.
+
+    Args:
+        agent: whose policy it is.
+        critics: agents by name, as `train_critics` returns them: a variant's seeds are named
+            "<variant>, seed <number>".
+        robot: its robot.
+        progress: print a line per part that is computed.
+        changes: settings of `compare_critics`; by default λ = 100 from the paper's ten starts, 50
+            episodes.
+
+    Returns:
+        {"records": ..., "provenance": ...}: the records of `compare_critics`, and for each critic
+        one of how well it predicts (critic, parameters, rho with low and high over 256 random
+        designs, explained_variance and rmse on bodies never seen).
+    """
+    require_agent(agent)
+    _require_critics(critics)
+    setting = {"starts": 10, "first_start": 0, "episodes": 50, "horizon": 1000, **changes}
+    groups: dict[str, dict] = {}
+    for name, one in critics.items():
+        groups.setdefault(name.partition(", seed ")[0], {})[name] = one
+
+    def predictions():
+        first = next(iter(critics.values()))
+        random = value_against_return(first, robot, horizon=setting["horizon"])
+        rho, scores = critic_correlations(critics, robot, random), held_out_scores(agent, critics)
+        return [
+            {
+                "critic": name,
+                "parameters": count_parameters(critics[name].critic["params"]),
+                **dict(zip(("rho", "low", "high"), map(float, rho[name]), strict=True)),
+                **scores[name]._asdict(),
+            }
+            for name in critics
+        ]
+
+    def found(variant):
+        records = compare_critics(groups[variant], robot, (100.0,), **setting)
+        # Penalty only is the same for all, and kept once.
+        first = variant == next(iter(groups))
+        return [record for record in records if first or record["critic"] is not None]
+
+    parts = {name: partial(found, name) for name in groups}
+    return result_in_parts(
+        f"critic_ablation_{agent.name}",
+        {"predictions": predictions, **parts},
+        progress=progress,
+        policy=agent.policy_hash,
+        critics={name: one.hash for name, one in critics.items()},
+        **setting,
+    )
