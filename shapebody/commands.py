@@ -211,7 +211,7 @@ def _design(words):
             method: vgds, or another name of shapebody.METHODS.
             start: number of a start design; the reference if not given.
             seed: of the search.
-            trust_region: the weight λ of the soft trust region.
+            trust_region: weight λ of the soft trust region.
             freeze: parameters that stay as they are, such as size (the scale of the whole body),
                 mass or Trunk; none frees all, as in the paper.
             out: write the found body to this MJCF file.
@@ -376,8 +376,7 @@ def _check_out(out, robot) -> None:
             f"--out is {out}, the file of the robot itself, whose reference body would be lost; "
             "give another name"
         )
-    folder = Path(path).absolute().parent
-    if not folder.is_dir():
+    if not (folder := Path(path).absolute().parent).is_dir():
         folder.mkdir(parents=True)
         print(f"made the folder {folder}")
 

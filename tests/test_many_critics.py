@@ -61,6 +61,15 @@ def test_other_formats_are_refused(tmp_path, layers):
         load_published_policy(tmp_path)
 
 
+@pytest.mark.parametrize("wrong", [5, {"softmax_temperature": "hot"}])
+def test_other_hyperparameters_are_refused(tmp_path, wrong):
+    write_published(tmp_path, published_layers(), "a")
+    path = tmp_path / "a.weights.json"
+    path.write_text(json.dumps(json.loads(path.read_text()) | {"hyperparams": wrong}))
+    with pytest.raises(ValueError, match="softmax_temperature in .* expected a number"):
+        load_published_policy(tmp_path)
+
+
 def test_each_critic_learns_as_if_it_were_alone(published, tmp_path):
     """And a run that was stopped ends with the same weights."""
     critics, steps = {"small": SMALL, "other": OTHER}, 32 * 3

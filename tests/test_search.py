@@ -302,7 +302,9 @@ def test_frozen_parameters_stay_at_the_reference(agent, robot, space, starts, me
 def test_unknown_parameters_cannot_be_frozen(agent, robot, space):
     assert not space.frozen(()).any()
     np.testing.assert_array_equal(space.frozen("size"), space.frozen(("size",)))
-    with pytest.raises(ValueError, match="no parameters 'weight' of robot 'legs_2' .*size, coupled_mass"):
+    with pytest.raises(
+        ValueError, match="no parameters 'weight' of robot 'legs_2' .*size, coupled_mass"
+    ):
         search("vgds", agent, robot, space.reference, frozen=("weight",))
 
 

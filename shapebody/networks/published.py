@@ -65,9 +65,22 @@ def read_published_policy(folder, name=None):
             raise FileNotFoundError(f"{path} is missing; a published policy needs both its files")
     index = read_json(index_file, "fetch both files again")
     weights = _read_layers(_layers_of(index, index_file), numbers_file)
-    config = _config(weights, index.get("hyperparams", {}), index_file)
+    config = _config(weights, _hyperparameters(index, index_file), index_file)
     variables = {"params": _params(weights), "constants": _identity_constants()}
     return Policy(config), variables, name
+
+
+def _hyperparameters(index, index_file) -> dict[str, float]:
+    """The policy's numbers by name; ValueError if they are none."""
+    found = index.get("hyperparams", {})
+    for name in ("softmax_temperature", "softmax_temperature_min", "policy_mean_abs_clip"):
+        value = found.get(name, 1.0) if isinstance(found, dict) else found
+        if isinstance(value, bool) or not isinstance(value, int | float):
+            raise ValueError(
+                f"{name} in {index_file} is {shown(value)}; expected a number: fetch both files "
+                "again"
+            )
+    return found
 
 
 def _layers_of(index, index_file) -> list[tuple[str, tuple[int, ...], int, int]]:

@@ -15,7 +15,7 @@ from shapebody.arguments import (
 from shapebody.configuration import from_json
 from shapebody.networks.config import CriticConfig
 from shapebody.task.config import TaskConfig
-from shapebody.training.config import MOST_STEPS, TrainConfig
+from shapebody.training.config import MOST_STEPS, TrainConfig, as_robots
 from shapebody.training.progress import announce
 from shapebody.training.replacing import metadata_in
 from shapebody.training.run_state import require_budget, require_own_config, require_same_robots
@@ -131,7 +131,7 @@ def evaluation_config(
             "was trained; restore its agent.json, or train it anew"
         )
     if published:
-        robots = tuple(agent.metadata["robots"])
+        robots = as_robots(agent.metadata.get("robots", list(agent.robots)))
         trained = TrainConfig.reduced(robots[0], robots=robots)
     else:
         what = f"metadata of agent {agent.name!r}: config"
