@@ -74,7 +74,7 @@ def _hyperparameters(index, index_file) -> dict[str, float]:
     """The policy's numbers by name; ValueError if they are none."""
     found = index.get("hyperparams", {})
     for name in ("softmax_temperature", "softmax_temperature_min", "policy_mean_abs_clip"):
-        value = found.get(name, 1.0) if isinstance(found, dict) else found
+        value = found.get(name, 1.0) if isinstance(found, dict) else str(found)
         if isinstance(value, bool) or not isinstance(value, int | float):
             raise ValueError(
                 f"{name} in {index_file} is {shown(value)}; expected a number: fetch both files "
