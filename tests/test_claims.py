@@ -393,7 +393,20 @@ def trajectories():
     yield "10", claim, alone.low < 0 < alone.high
 
 
-PARTS = (robots_and_training, value_gradient_design, trust_region, baselines, trajectories)
+def own_robot():
+    claim = 'the answer of "Would you build it?" below is to keep the file as written'
+    (verdict,) = output("16", r"^tuned: (.*)$")
+    yield "16", claim, verdict == "keep the file as written."
+
+
+PARTS = (
+    robots_and_training,
+    value_gradient_design,
+    trust_region,
+    baselines,
+    trajectories,
+    own_robot,
+)
 
 
 @pytest.mark.parametrize("part", PARTS, ids=lambda part: part.__name__)

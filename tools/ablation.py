@@ -4,7 +4,7 @@
     python -m tools.ablation unitree_go2 --published downloads   # with the authors' policy
 
 Training and comparison are added up in data/results/critic_ablation_<agent>.json. Stopped, the same
-call goes on. About 4 hours on two cores with the defaults.
+call goes on. Reckoned, not yet measured: 4 hours on two cores with the defaults.
 """
 
 from pathlib import Path

@@ -1,5 +1,7 @@
 """Whether a found body is worth building: what a gain in return does not say."""
 
+import functools
+
 import jax
 import numpy as np
 
@@ -8,6 +10,7 @@ from shapebody.design.descriptions import describe
 from shapebody.design.space import DesignSpace
 from shapebody.evaluation.evaluate import Evaluation
 from shapebody.evaluation.statistics import paired_gain
+from shapebody.robot.robot import Robot
 
 LARGE_CHANGE = 0.2
 """Share by which mass or a length may change before the body counts as another robot."""
@@ -25,10 +28,16 @@ def whole_body(space: DesignSpace, f) -> dict[str, tuple[float, float, str]]:
     if space.validate(f).ndim != 1:
         raise ValueError(f"design has shape {np.shape(f)}; expected one design [{space.dim}]")
     both = np.stack([space.reference, space.validate(f)])
-    told = jax.jit(describe(space.robot))(space(both))
+    told = _described(space.robot)(space(both))
     values = {"mass": (told.total_mass, "kg"), "height of the IMU": (told.imu_height, "m")}
     values |= {f"extent in {axis}": (told.dimensions[:, i], "m") for i, axis in enumerate("xyz")}
     return {name: (float(pair[0]), float(pair[1]), unit) for name, (pair, unit) in values.items()}
+
+
+@functools.lru_cache(maxsize=4)
+def _described(robot: Robot):
+    """`describe`, compiled once for a robot."""
+    return jax.jit(describe(robot))
 
 
 def changes(space: DesignSpace, f, groups: int = 8) -> str:

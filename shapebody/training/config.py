@@ -111,9 +111,11 @@ class TrainConfig:
     the policy at the start of the iteration."""
     mirror_coefficient: NonNegative = 0.0
     """Weight of the mirror loss: the squared difference, summed over joints, between the action
-    means on a body and the mirrored ones on its mirror image (`design.mirror`). 0: without."""
+    means on a body and the mirrored ones on its mirror image (`design.mirror`). 0: without. A sum,
+    so the same weight is more for a robot with more joints."""
     mirrored_critic: Flag = False
-    """Whether the critic learns a random half of each rollout as its mirror image."""
+    """Whether the critic learns a random half of each rollout as its mirror image. An exact state
+    (training.safetensors) of a run without mirror images does not go on with them."""
     kl_threshold: Threshold = 0.5
     """The rest of an iteration's updates is skipped once a minibatch exceeds this; inf: never."""
 

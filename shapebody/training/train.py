@@ -19,7 +19,7 @@ from shapebody.arguments import (
 )
 from shapebody.configuration import from_json
 from shapebody.files import atomic_write
-from shapebody.robot.robot import load_robot
+from shapebody.robot.robot import find
 from shapebody.stored import read_json
 from shapebody.training.config import MOST_STEPS, TrainConfig, located
 from shapebody.training.progress import announce
@@ -161,7 +161,7 @@ def _train(
     # At once: the trainer, which looks again, takes a while to compile.
     require_own_config(folder, config, tuple(changeable))
     for robot in config.robots:  # an unknown one is refused before anything is announced
-        load_robot(located(robot))
+        find(located(robot))
     announce(engine, len(config.robots), progress)
     trainer = Trainer(config, folder, engine)
     # From reading the state to saving the agent: what another call has written meanwhile would be
